@@ -14,14 +14,9 @@ __all__ = ["BodyScene", "MolecularScene", "Scene", "parse_override", "schema"]
 
 
 def schema() -> dict[str, Any]:
-    """The JSON schema of scene files: of a single body with a table [body], of molecules without one.
-
-    With this condition an editor checks a file as the kind of scene that it is.
-    """
-    scenes: list[tuple[type[BaseModel], JsonSchemaMode]] = [
-        (kind, "validation") for kind in (BodyScene, MolecularScene)
-    ]
-    _, found = models_json_schema(scenes, schema_generator=_TomlSchema)
+    """The JSON schema of scene files: `BodyScene` for a file with a table [body], else `MolecularScene`."""
+    kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [(BodyScene, "validation"), (MolecularScene, "validation")]
+    _, found = models_json_schema(kinds, schema_generator=_TomlSchema)
     found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
@@ -49,4 +44,4 @@ class _TomlSchema(GenerateJsonSchema):
         return found
 
     def field_title_should_be_set(self, schema) -> bool:
-        return False  # "Timestep Fs" says nothing that timestep_fs does not
+        return False  # "Timestep Fs" adds nothing to timestep_fs

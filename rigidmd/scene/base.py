@@ -1,10 +1,10 @@
-"""A scene: one frozen, validated value that determines a run completely. Reading one."""
+"""The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys of it."""
 
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
 
 from pydantic import Field, PrivateAttr, ValidationError
 
@@ -15,20 +15,30 @@ from rigidmd.core.toml import (
     TOMLDecodeError,
     impossible_values,
     parse_toml,
+    parse_whole_number,
     plain_values,
     read_toml,
     shorten_repr,
-    parse_whole_number,
 )
 from rigidmd.errors import SceneError
 from rigidmd.scene.shipped import examples
-from rigidmd.scene.validation import Section, validation_messages, did_you_mean, similar_names, numbers_out_of_range, suggestion, location_of
+from rigidmd.scene.validation import (
+    Section,
+    did_you_mean,
+    location_of,
+    numbers_out_of_range,
+    similar_names,
+    suggestion,
+    validation_messages,
+)
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene
     from rigidmd.scene.molecules import MolecularScene
 
 LONGEST_NAME = 100
+PathName = str | os.PathLike
+AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
 
 class Scene(Section, Displayed):
@@ -38,10 +48,10 @@ class Scene(Section, Displayed):
     """
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
-    """Name of the run; default: that of the file"""
+    """Name of the run; default: the name of the file"""
 
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
-    """What numbers may have as absolute values, unless they are 0: squares and products then stay finite"""
+    """Smallest and largest absolute value of numbers other than 0, so that squares and products stay finite"""
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
@@ -54,58 +64,50 @@ class Scene(Section, Displayed):
 
     @property
     def in_short(self) -> str:
-        """One line about it."""
+        """A description in one line."""
         return self.name
 
     @property
     def source(self) -> str:
-        """The file it was read from, for messages."""
+        """Path of the file, for messages."""
         return self._source
 
-    def with_end(self, until: float) -> "Scene":
-        """The same scene with an end at a time of the run. Raises SceneError where it has none to set."""
+    def with_end(self, time: float) -> "Scene":
+        """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot be set."""
         raise SceneError(self.source, ["--until is for molecules; set run.duration_s of a single body"])
 
     def path(self, file: str) -> Path:
-        """A file named in the scene: relative to the scene's own folder."""
+        """Path of a file that the scene names relative to its folder."""
         return self._folder / file
 
     @property
     def inputs(self) -> dict[str, Path]:
-        """Every further file that it reads: dotted key -> path."""
+        """The other files that the scene reads: dotted key -> path."""
         return {}
 
     @property
     def embedded_files(self) -> dict[str, bytes]:
-        """Contents of further inputs that lie in no file: dotted key, whose value names the file, -> content. The
-        folder of a run has them as files."""
+        """Inputs that are not on disk: dotted key of the file's name -> content. A run writes them to its folder."""
         return self._embedded_files
 
     @classmethod
     def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        """Faults: files of a scene that lie outside its folder."""
+        """Messages on files of a scene that lie outside its folder."""
         return []
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
-        """Faults between tables. They are found even if a table has faults of its own."""
+        """Messages on tables that contradict each other, found even if single tables are invalid."""
         return []
 
     @overload
     @classmethod
-    def read(
-        cls: "type[MolecularScene]", path: str | os.PathLike, overrides: dict[str, Any] | None = None
-    ) -> "MolecularScene": ...
+    def read(cls: type[AnyScene], path: PathName, overrides: dict[str, Any] | None = None) -> AnyScene: ...
     @overload
     @classmethod
-    def read(
-        cls: "type[BodyScene]", path: str | os.PathLike, overrides: dict[str, Any] | None = None
-    ) -> "BodyScene": ...
-    @overload
+    def read(cls, path: PathName, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene": ...
     @classmethod
-    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene": ...
-    @classmethod
-    def read(cls, path: str | os.PathLike, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
+    def read(cls, path: PathName, overrides: dict[str, Any] | None = None) -> "MolecularScene | BodyScene":
         """The scene in a TOML file, with single keys overridden: {"stages.1.timestep_fs": 4}. Raises SceneError.
 
         An override of None removes the key. Files named in the scene must lie in its folder or below; files named in
@@ -119,48 +121,26 @@ class Scene(Section, Displayed):
     @overload
     @classmethod
     def from_dict(
-        cls: "type[MolecularScene]",
-        data: dict[str, Any],
-        folder: str | os.PathLike = ".",
-        overrides: dict[str, Any] | None = None,
-        source: str = "scene",
-        text: str = "",
-    ) -> "MolecularScene": ...
+        cls: type[AnyScene], data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
+        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
+    ) -> AnyScene: ...  # fmt: skip
     @overload
     @classmethod
     def from_dict(
-        cls: "type[BodyScene]",
-        data: dict[str, Any],
-        folder: str | os.PathLike = ".",
-        overrides: dict[str, Any] | None = None,
-        source: str = "scene",
-        text: str = "",
-    ) -> "BodyScene": ...
-    @overload
+        cls, data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
+        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
+    ) -> "MolecularScene | BodyScene": ...  # fmt: skip
     @classmethod
     def from_dict(
-        cls,
-        data: dict[str, Any],
-        folder: str | os.PathLike = ".",
-        overrides: dict[str, Any] | None = None,
-        source: str = "scene",
-        text: str = "",
-    ) -> "MolecularScene | BodyScene": ...
-    @classmethod
-    def from_dict(
-        cls,
-        data: dict[str, Any],
-        folder: str | os.PathLike = ".",
-        overrides: dict[str, Any] | None = None,
-        source: str = "scene",
-        text: str = "",
-        embedded_files: dict[str, bytes] | None = None,
-    ) -> "MolecularScene | BodyScene":
-        """The scene of a nested dictionary like that of a TOML file. Raises SceneError with every fault.
+        cls, data: dict[str, Any], folder: PathName = ".", overrides: dict[str, Any] | None = None,
+        source: str = "scene", text: str = "", embedded_files: dict[str, bytes] | None = None,
+    ) -> "MolecularScene | BodyScene":  # fmt: skip
+        """The scene in a nested dictionary like the one of a TOML file. Raises SceneError with all errors.
 
-        Numbers and arrays of NumPy and paths may stand for numbers, lists and texts. The dictionary is not changed.
+        Numbers and arrays of NumPy and paths are accepted as numbers, lists and texts. The dictionary is not changed.
 
-        held : see `embedded_files`; files of a scene that holds inputs, which Python made, may be anywhere
+        source, text : path of the TOML file, for messages, and its text, for the numbers of lines in them
+        embedded_files : see `embedded_files`; with them, files may be outside `folder`
         """
         folder, data = Path(folder), plain_values(data)
         overrides = {key: plain_values(value) for key, value in (overrides or {}).items()}
@@ -175,12 +155,14 @@ class Scene(Section, Displayed):
             key, wrong = _override(data, named, value)
             faults += wrong
             if value is None and parse_whole_number(key.rpartition(".")[2]) is not None:
-                text = ""  # entries after a removed one have other numbers than in the text
+                text = ""  # the entries after a removed one are numbered differently in the text
             else:
                 overridden.append(key)
         if wrong := impossible_values(data):
             raise SceneError(source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong])
-        faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in numbers_out_of_range(data, *kind.SIZES)]
+        faults += [
+            f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in numbers_out_of_range(data, *kind.SIZES)
+        ]
         faults += kind.contradictions(data, text)
 
         def refusal(found: list[str]) -> SceneError:
@@ -200,18 +182,20 @@ class Scene(Section, Displayed):
         return scene
 
     def _missing_files(self, text: str, overridden: Iterable[str]) -> list[str]:
-        """Faults: missing files, by line and key."""
+        """Messages on missing files, with line and key."""
         faults = []
         for key, path in self.inputs.items():
             if not (fault := unreadable_reason(path)):
                 continue
             keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
-            faults.append(f"{location_of(keys, text, overridden)}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
+            faults.append(
+                f"{location_of(keys, text, overridden)}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}"
+            )
         return faults
 
 
 def read_tables(path: Path) -> tuple[dict[str, Any], str]:
-    """The tables of a scene file, and its text. Raises SceneError, which names a shipped scene of such a name."""
+    """The tables of a scene file, and its text. Raises SceneError, which suggests shipped scenes of similar names."""
     fault = unreadable_reason(path)
     if fault.startswith("there is no such file"):
         shipped = similar_names(path.stem, [example.name for example in examples()])
@@ -221,43 +205,43 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def default_name(path: Path) -> str:
-    """The name of the scene in a file that says none."""
+    """The name of a scene whose file sets none."""
     return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
 
 
-def _similar_files(path: Path, ending: str = "") -> str:
+def _similar_files(path: Path, suffix: str = "") -> str:
     """'; did you mean ...?' for files of similar names in the folder of a path; empty if there are none."""
     try:
-        there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(ending)]
+        there = [other for other in sorted(path.parent.iterdir()) if other.name.endswith(suffix)]
     except (OSError, ValueError):
         return ""
     stems = similar_names(path.stem, {other.stem for other in there if other.name != path.name})
     return suggestion([other.name for other in there if other.stem in stems])
 
 
-def file_name(name: str, endings: tuple[str, ...]) -> str:
-    """A plain file name with one of these endings. Raises ValueError."""
+def file_name(name: str, extensions: tuple[str, ...]) -> str:
+    """A plain file name with one of these extensions. Raises ValueError."""
     if not re.fullmatch(r"[\w\-][\w.\-]*", name):
         raise ValueError(f"is {name!r}, must be a plain file name without a folder")
     if name.startswith("input_"):
-        raise ValueError(f"is {name!r}; names beginning with input_ are kept for copies of input files")
-    if not name.endswith(endings):
-        raise ValueError(f"is {name!r}, must end in one of {' '.join(endings)}")
+        raise ValueError(f"is {name!r}; names beginning with input_ are reserved for copies of input files")
+    if not name.endswith(extensions):
+        raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
     return name
 
 
 def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
-    """The kind of scene with these tables; None if no table belongs to either kind."""
+    """The class of scenes with these tables; None if no table belongs to either class."""
     for kind, marker in ((body, "body"), (molecules, "molecules")):
         if marker in data:
             return kind
-    own = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
-    best = max(own, key=lambda kind: own[kind])
-    return best if own[best] > 0 else None
+    count = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
+    best = max(count, key=lambda kind: count[kind])
+    return best if count[best] > 0 else None
 
 
 def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
-    """How the command line removes the keys that contradict overridden ones; empty for any other fault."""
+    """How to remove the keys that contradict overridden ones on the command line; empty for any other error."""
     if not re.search("not both|omit one|contradict", fault):
         return ""
     names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
@@ -269,7 +253,7 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
 
 
 def _has_key(data: Any, key: str) -> bool:
-    """Whether nested tables have a dotted key, which is not a table itself."""
+    """Whether nested tables have a dotted key that is not a table."""
     for part in key.split("."):
         if not isinstance(data, dict) or part not in data:
             return False
@@ -278,9 +262,9 @@ def _has_key(data: Any, key: str) -> bool:
 
 
 def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
-    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, and faults.
+    """Set one dotted key in nested tables and lists in place; None removes it.
 
-    An entry of a list is named by its number from 0, or by its name: the key that is returned has its number.
+    Returns the key, in which entries of lists are given by number and not by name, and error messages.
     """
     if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.[^.]+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
@@ -319,16 +303,13 @@ def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
 
 
 def _name_of_entry(entry: Any) -> Any:
-    """What an entry of a list is called: a stage by its name or ensemble, molecules by their name or model."""
+    """The name of an entry of a list: of a stage its name or ensemble, of molecules their name or model."""
     keys = [key for key in ("name", "ensemble", "model") if isinstance(entry, dict) and key in entry]
     return entry[keys[0]] if keys else ""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """KEY=VALUE of the command line: the value is read as TOML, or else as text; None if empty.
-
-    Raises SceneError.
-    """
+    """KEY=VALUE of the command line. The value is read as TOML, else as text; None if empty. Raises SceneError."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SceneError("--set", [f"{text!r} is not KEY=VALUE, for example stages.1.timestep_fs=4"])

@@ -1,6 +1,6 @@
 """The scene of a single body: a top, a gyroscope, a satellite, a falling stone. SI units throughout.
 
-The equations contain no constant of nature, so any other consistent units work as well.
+The equations contain no physical constants, so any other consistent units work as well.
 """
 
 from typing import Annotated, Any, Literal
@@ -12,15 +12,15 @@ from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor
 from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
-    unit_vector,
     from_attitude_matrix,
     from_euler_angles,
     from_quaternion,
     from_yaw_pitch_roll,
     nearest_rotation,
     orthogonality_error,
+    unit_vector,
 )
-from rigidmd.mechanics.solids import NUMBERS, SOLIDS
+from rigidmd.mechanics.solids import COMPONENTS_PER_DIMENSION, SOLIDS
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.body_forces import (
     Applied,
@@ -32,19 +32,19 @@ from rigidmd.scene.body_forces import (
     NonNegativeVector,
     PositiveVector,
     Wheel,
-)
+)  # fmt: skip
 from rigidmd.scene.limits import BodyWatch
 from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, location_of
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
 
-#: A rotation matrix with fewer than about nine digits is refused without `project`.
+#: A rotation matrix with fewer than about nine digits is an error without `project`.
 LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 
-#: Moments of inertia are equal, for a picture, if they differ by less than this share of the largest.
+#: Moments of inertia are equal, for a picture, if they differ by less than this fraction of the largest.
 EQUAL_MOMENTS = 1e-6
 
 
@@ -58,22 +58,22 @@ class Solid(Section):
     """A homogeneous solid; axis 3 is its axis of symmetry; a cone stands on its tip."""
 
     shape: Literal[tuple(SOLIDS)]  # type: ignore[valid-type]
-    """Its shape"""
+    """Shape"""
     radius_m: Positive | None = None
-    """Of a cylinder, cone, sphere, disk, ring"""
+    """Radius of a cylinder, cone, sphere, disk, ring"""
     height_m: Positive | None = None
-    """Of a cylinder, cone"""
+    """Height of a cylinder, cone"""
     length_m: Positive | None = None
-    """Of a rod"""
+    """Length of a rod"""
     lengths_m: PositiveVector | None = None
-    """Of a cuboid"""
+    """Edges of a cuboid"""
     semi_axes_m: PositiveVector | None = None
-    """Of an ellipsoid"""
+    """Semi-axes of an ellipsoid"""
 
     @property
     def dimensions(self) -> dict[str, Any]:
         """The dimensions given."""
-        return {key: value for key in NUMBERS if (value := getattr(self, key)) is not None}
+        return {key: value for key in COMPONENTS_PER_DIMENSION if (value := getattr(self, key)) is not None}
 
     @model_validator(mode="after")
     def _has_its_dimensions(self):
@@ -91,14 +91,14 @@ class PointMass(Section):
     mass_kg: Positive
     """Mass"""
     position_m: Vector
-    """Body axes, from any origin; from the pivot if the body is pinned"""
+    """Position along the body axes, from any origin; from the pivot if the body is pinned"""
 
 
 class BodyTable(Section):
     """The body: mass, inertia and pivot. Without inertia it is a point."""
 
     mass_kg: Positive | None = None
-    """Mass; with points it is their sum"""
+    """Mass; with points the sum of their masses"""
     solid: Solid | None = None
     """Inertia of a homogeneous solid"""
     points: tuple[PointMass, ...] | None = Field(default=None, min_length=1)
@@ -112,7 +112,7 @@ class BodyTable(Section):
     pinned: Flag = False
     """One point of the body is fixed"""
     centre_of_mass_m: Vector | None = None
-    """From the pivot, body axes; of a pinned body"""
+    """Centre of mass of a pinned body, from the pivot, along the body axes"""
 
     def _faults(self):
         faults = []
@@ -124,7 +124,7 @@ class BodyTable(Section):
         if self.points is not None and self.mass_kg is not None:
             faults.append("mass_kg would do nothing: the points have masses")
         if not self.pinned and self.centre_of_mass_m is not None:
-            faults.append("centre_of_mass_m is that of a pinned body, from its pivot; this one is not pinned")
+            faults.append("centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned")
         if self.points is not None and self.centre_of_mass_m is not None:
             faults.append("centre_of_mass_m would do nothing: it follows from the points")
         if self.inertia_about == "pivot":
@@ -161,7 +161,7 @@ class BodyTable(Section):
 
 
 class BodyStart(Section):
-    """The start. Attitude and motion are relative to the frame if there is one."""
+    """Attitude and motion at the start, relative to [frame] if there is one."""
 
     euler_angles_deg: Vector | None = None
     """phi, theta, psi (3-1-3): Q = Rz(phi) Rx(theta) Rz(psi)"""
@@ -172,19 +172,19 @@ class BodyStart(Section):
     rotation: Matrix | None = None
     """Rows of Q, body to lab: x_lab = Q x_body"""
     attitude_matrix: Matrix | None = None
-    """Rows of T = Q^T, lab to body, the convention for satellites"""
+    """Rows of T = Q^T, lab to body, the usual convention for satellites"""
     project: Flag = False
     """Replace the given matrix by the nearest rotation"""
     euler_rates_rad_s: Vector | None = None
     """phi', theta', psi'"""
     angular_velocity_body_rad_s: Vector | None = None
-    """Along the body's axes"""
+    """Angular velocity along the body axes"""
     angular_velocity_lab_rad_s: Vector | None = None
-    """Along the lab's (or frame's) axes"""
+    """Angular velocity along the axes of the lab, or of the frame"""
     position_m: Vector | None = None
-    """Of the centre of mass of a body that is not pinned"""
+    """Position of the centre of mass of a body that is not pinned"""
     velocity_m_s: Vector | None = None
-    """Of the centre of mass of a body that is not pinned"""
+    """Velocity of the centre of mass of a body that is not pinned"""
 
     def _faults(self):
         attitudes = ("euler_angles_deg", "yaw_pitch_roll_deg", "quaternion_wxyz", "rotation", "attitude_matrix")
@@ -217,7 +217,7 @@ class BodyStart(Section):
                 yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
                 yield (
-                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' turn about "
+                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' rotate about "
                     "the same axis there; give angular_velocity_body_rad_s"
                 )
 
@@ -238,7 +238,7 @@ class BodyStart(Section):
 
     @property
     def angular_velocity(self) -> np.ndarray:
-        """Along the body's axes (3,), rad/s."""
+        """Angular velocity (3,) along the body axes, rad/s."""
         if self.euler_rates_rad_s is not None and self.euler_angles_deg is not None:
             return angular_velocity_of_euler_rates(np.radians(self.euler_angles_deg), np.array(self.euler_rates_rad_s))
         if self.angular_velocity_lab_rad_s is not None:
@@ -252,22 +252,23 @@ class Run(Section):
     duration_s: Positive
     """Duration"""
     timestep_s: Positive
-    """Time step; with dop853 and radau, which choose their own, the time between looks; with auto the longest step"""
+    """Time step; with dop853 and radau, whose steps are adaptive, the interval between observations; with auto the
+    longest step"""
     integrator: Literal[(*SCHEMES, AUTO, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
     """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
     a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
     """With auto: rms error of the energy over the run, as a fraction of the largest kinetic energy"""
     trajectory_error: Positive | None = None
-    """With auto: largest error of Q at the end; for a point that of X in m"""
+    """With auto: largest error of Q at the end; for a point the error of X in m"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
+    """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""
     formulation: Literal[tuple(FORMULATIONS)] | None = None  # type: ignore[valid-type]
     """Variables of the attitude for rk4, dop853 and radau; default: matrix"""
     relative_tolerance: Annotated[float, Strict(), Field(ge=1e-13, lt=1)] | None = None
-    """Of dop853 and radau; default: 1e-10"""
+    """Relative tolerance of dop853 and radau; default: 1e-10"""
     absolute_tolerance: Positive | None = None
-    """Of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
+    """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
 
     def _faults(self):
         if self.rotor is not None and self.integrator in SOLVERS:
@@ -288,12 +289,11 @@ class Run(Section):
 
     @property
     def is_auto(self) -> bool:
-        """Whether integrator and step are still open."""
+        """Whether integrator and step are still to be chosen."""
         return self.integrator == AUTO
 
     @property
     def steps(self) -> int:
-        """Number of steps, rounded."""
         return round(self.duration_s / self.timestep_s)
 
 
@@ -301,29 +301,29 @@ class BodyOutput(Section):
     """Files in the folder of the run."""
 
     interval_s: Positive | None = None
-    """Time between samples, in motion.csv and the trajectory; default: a two-thousandth of the duration"""
+    """Time between samples in motion.csv and the trajectory; default: the duration divided by 2000"""
     npz: Flag = False
     """Also write motion.npz, the same columns as arrays"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory of points of the body for viewers; the ending sets the format; false for none"""
+    """Trajectory of points of the body for viewers; the extension sets the format; false for none"""
     topology: str | None = None
-    """File that viewers need beside the trajectory (.gro, or .pdb, which also tells the edges of the body as bonds);
+    """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the edges of the body);
     default: topology.pdb, or topology.gro for a body that starts more than 900 Å of the trajectory away"""
     trajectory_A_per_m: Positive | None = None
     """Ångström in the trajectory per metre; default: the body has a radius of 10 Å. A second becomes a ps"""
     figures: Flag = True
     """Draw the motion"""
     checkpoint_minutes: Annotated[float, Strict(), Field(gt=0, le=1e9)] | Literal[False] = 5.0
-    """Wall time between checkpoints, from which a run goes on after a stop; false for none. Runs by radau have
+    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none. Runs with radau have
     none"""
     axis: Vector | None = None
     """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
 
     drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
-    """Shape that films and pages draw, and nothing else: "top", "ellipsoid" or "cuboid" of the body's mass and inertia,
-    or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default: the solid or
-    the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if it is pinned
-    outside; else a cuboid"""
+    """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with the mass and inertia
+    of the body, or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default:
+    the solid or the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if
+    it is pinned outside; else a cuboid"""
 
     @field_validator("trajectory")
     @classmethod
@@ -336,9 +336,9 @@ class BodyOutput(Section):
         return name if name is None else file_name(name, (".gro", ".pdb"))
 
     @model_validator(mode="after")
-    def _apart(self):
+    def _files_differ(self):
         if self.trajectory and self.trajectory in (self.topology, "topology.pdb" if self.topology is None else None):
-            raise ValueError(f"topology and trajectory are both {self.trajectory}; name them apart")
+            raise ValueError(f"topology and trajectory are both {self.trajectory}; give them different names")
         if self.axis is not None and not any(self.axis):
             raise ValueError("axis is zero, which is not a direction")
         return self

@@ -16,10 +16,10 @@ Times = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
 
 
 class Gravity(Section):
-    """A uniform field."""
+    """Uniform gravity."""
 
     acceleration_m_s2: Vector = (0.0, 0.0, -9.81)
-    """Along the lab's (or frame's) axes"""
+    """Acceleration along the axes of the lab, or of the frame"""
 
 
 class Timed(Section):
@@ -28,9 +28,9 @@ class Timed(Section):
     times_s: Times | None = None
     """Increasing times; each quantity is then a list of as many values"""
     from_s: NonNegative | None = None
-    """Begin"""
+    """Begin of the window of time; default: 0"""
     to_s: NonNegative | None = None
-    """End"""
+    """End of the window of time; default: none"""
 
     @field_validator("times_s")
     @classmethod
@@ -41,10 +41,10 @@ class Timed(Section):
         return times
 
     def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
-        """Faults between the times and these quantities; a single value is of type `entry`."""
+        """Messages on quantities that do not match the times; a single value has the type `entry`."""
         faults, times = [], self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
-            faults.append("from_s and to_s would do nothing beside times_s")
+            faults.append("from_s and to_s would do nothing next to times_s")
         if not (self.to_s is None or self.to_s > (self.from_s or 0)):
             faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
         for key, value in values.items():
@@ -64,7 +64,6 @@ class Timed(Section):
 
     @property
     def window(self) -> tuple[float, float]:
-        """Begin and end."""
         return self.from_s or 0.0, inf if self.to_s is None else self.to_s
 
 
@@ -72,13 +71,14 @@ class Applied(Timed):
     """An external force and torque."""
 
     axes: Literal["lab", "body"] = "lab"
-    """Axes of the components: fixed in the lab, or turning with the body"""
+    """Axes of the components: fixed in the lab, or rotating with the body"""
     force_N: Vector | tuple[Vector, ...] | None = None
     """Force"""
     torque_N_m: Vector | tuple[Vector, ...] | None = None
-    """Torque in addition to that of the force"""
+    """Torque in addition to the torque of the force"""
     at_m: Vector | None = None
-    """Point of action, body axes, from the centre of mass or the pivot; default: that point itself"""
+    """Point of action, along the body axes, from the centre of mass, or from the pivot of a pinned body; default: that
+    point itself"""
 
     def _faults(self):
         yield from self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
@@ -94,7 +94,7 @@ class Friction(Section):
     viscous_N_m_s: NonNegativeVector = (0.0, 0.0, 0.0)
     """Torque per angular velocity, about each axis"""
     dry_N_m: NonNegativeVector = (0.0, 0.0, 0.0)
-    """Torque against any turning, about each axis"""
+    """Torque against any rotation, about each axis"""
 
 
 class Fluid(Section):
@@ -113,7 +113,8 @@ class Fluid(Section):
     displaced_mass_kg: NonNegative | None = None
     """Mass of the fluid displaced: buoyancy is its weight"""
     centre_of_buoyancy_m: Vector | None = None
-    """Point where buoyancy acts, body axes, from the centre of mass or the pivot; default: the centre of mass"""
+    """Point where buoyancy acts, along the body axes, from the centre of mass, or from the pivot of a pinned body;
+    default: the centre of mass"""
     added_mass_kg: NonNegativeVector | None = None
     """Mass of fluid carried along each axis"""
     added_inertia_kg_m2: NonNegativeVector | None = None
@@ -121,14 +122,14 @@ class Fluid(Section):
 
 
 class Frame(Timed):
-    """A frame with turning axes or an accelerated origin; the motion is relative to it."""
+    """A frame with rotating axes or an accelerated origin; the motion is relative to it."""
 
     angular_velocity_rad_s: Vector | tuple[Vector, ...] | None = None
-    """Of the frame, along its own axes"""
+    """Angular velocity of the frame, along its own axes"""
     angular_acceleration_rad_s2: Vector | None = None
-    """Of the frame, along its own axes, constant from the start"""
+    """Angular acceleration of the frame, along its own axes, constant from the start"""
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
-    """Of the frame's origin, along the frame's axes; the body feels the opposite acceleration"""
+    """Acceleration of the frame's origin, along the frame's axes; the body has the opposite acceleration"""
 
     def _faults(self):
         timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
@@ -142,14 +143,14 @@ class Frame(Timed):
 
 
 class Wheel(Timed):
-    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except that about this axis."""
+    """A rotor on an axis fixed in the body. The inertia of the body includes the wheel, except about this axis."""
 
     axis: Vector
-    """Direction of the axis, body axes, of any length"""
+    """Direction of the axis, along the body axes, of any length"""
     momentum_kg_m2_s: Number = 0.0
     """Initial angular momentum along the axis, relative to the lab"""
     motor_torque_N_m: Number | tuple[Number, ...] | None = None
-    """Torque of its motor on the wheel; the body feels the opposite"""
+    """Torque of the motor on the wheel; the opposite torque acts on the body"""
 
     def _faults(self):
         yield from self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
@@ -161,10 +162,8 @@ class Wheel(Timed):
 
 
 class ChangingInertia(Timed):
-    """Principal moments as given functions of time, along fixed body axes; mass and centre of mass do not change.
-
-    About the centre of mass, which must be the pivot of a pinned body.
-    """
+    """Principal moments about the centre of mass as given functions of time, along fixed body axes; mass and centre of
+    mass do not change. The pivot of a pinned body must be its centre of mass."""
 
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""

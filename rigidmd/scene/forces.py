@@ -1,4 +1,4 @@
-"""Tables of a scene of molecules: forces between sites."""
+"""The table [forces] of a scene of molecules: forces between sites."""
 
 from math import inf
 from typing import Annotated, Any, Literal
@@ -14,7 +14,7 @@ KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
 Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
-#: Keys of `Forces` for some kinds of electrostatics only.
+#: Keys of `Forces` -> the methods of electrostatics that use them.
 ELECTROSTATIC_KEYS = {
     "reaction_field_permittivity": ("reaction_field",),
     "damping_per_A": ("damped_shifted_force",),
@@ -30,12 +30,12 @@ ELECTROSTATIC_KEYS = {
 }
 
 
-#: A cutoff within this fraction of the minimum of an energy is that minimum, rounded: its sites are meant to repel.
+#: A cutoff this close to the minimum of an energy, as a fraction, is the rounded minimum of a repulsive potential.
 MINIMUM_TOLERANCE = 0.01
 
 
 def short_cutoff_note(cutoff: float, sites: str, minimum: float) -> str:
-    """A note on a cutoff (Å) within the minimum of the energy of two sites."""
+    """A note on a cutoff (Å) below the minimum of the energy of two sites."""
     unit = "Is it in nm? " if cutoff < 2 < minimum else ""
     return (
         f"a cutoff of {cutoff:g} Å is shorter than {minimum:.3g} Å, where the energy of {sites} has its minimum: they "
@@ -44,7 +44,7 @@ def short_cutoff_note(cutoff: float, sites: str, minimum: float) -> str:
 
 
 def default_switch_start(truncation: str, cutoff: float) -> float:
-    """Where a switch begins if a scene does not say, Å."""
+    """The default of switch_start_A, Å."""
     return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
 
 
@@ -60,38 +60,39 @@ class UnlikePair(Section):
 
 
 class PairParameters(Section):
-    """Parameters of a force of one's own between two kinds of sites."""
+    """Parameters of a custom pair potential between two kinds of sites."""
 
     sites: tuple[str, str]
     """The two kinds, by site, SPECIES.SITE or element"""
     parameters: dict[str, Number] = Field(max_length=MOST_TABLES)
-    """The parameters"""
+    """Parameters by name"""
 
 
 class CustomForce(Section):
-    """A force of one's own: a formula between pairs of sites, or an object of a Python file."""
+    """A custom force: a formula of the distance between sites, or an object in a Python file."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
-    """Name in the log; with `module` also that of the object in it"""
+    """Name in the log; with `module` also the name of the object in it"""
     module: Line | None = None
-    """Python file in the scene's folder. It is code, and runs only with --trust FILE"""
+    """Python file in the folder of the scene. Its code runs only with --trust FILE"""
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
-    """Without a module: energy of a pair of sites (kJ/mol) of their distance r (Å) and named parameters, such as
-    A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
+    """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å) and named parameters,
+    such as A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
     parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
-    """With a module: what its object is called with. With an energy: numbers, the same for all sites, or a table of
-    numbers for each kind of sites, by site, SPECIES.SITE or element; default: `parameters` in the models' files"""
+    """With a module: arguments with which its object is called. With an energy: numbers, the same for all sites, or a
+    table of numbers for each kind of sites, by site, SPECIES.SITE or element; default: `parameters` in the models'
+    files"""
     sites: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With an energy: the only sites that it acts on"""
+    """With an energy: the sites that it acts on; default: all with parameters"""
     pairs: tuple[PairParameters, ...] = Field(default=(), max_length=MOST_TABLES)
-    """With an energy: parameters of particular pairs, in place of mixed ones"""
+    """With an energy: parameters of particular pairs, in place of mixed parameters"""
     mixing: dict[str, Literal["geometric", "arithmetic", "harmonic"]] = Field(default={}, max_length=MOST_TABLES)
     """With an energy: the mean of each parameter for unlike sites; default: arithmetic for names that begin with sig,
     else geometric"""
     truncation: Truncation | None = None
-    """With an energy: how it ends at the cut-off; default: forces.truncation"""
+    """With an energy: its cutoff scheme; default: forces.truncation"""
     cutoff_A: Positive | None = None
-    """With an energy: its cut-off; default: forces.cutoff_A"""
+    """With an energy: its cutoff; default: forces.cutoff_A"""
     switch_start_A: Positive | None = None
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
@@ -100,8 +101,8 @@ class CustomForce(Section):
         if (self.module is None) == (self.energy is None):
             raise ValueError("give a module, a Python file with the force, or an energy, a formula of r")
         if self.module is not None:
-            own = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
-            idle = [key for key in own if getattr(self, key) not in (None, (), {})]
+            of_energy = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
+            idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
             if idle:
                 raise ValueError(f"{', '.join(idle)} would do nothing with a module: its object has `parameters`")
             if not self.module.endswith(".py"):
@@ -113,30 +114,30 @@ class Forces(Section):
     """Forces between sites of different molecules."""
 
     cutoff_A: Positive | None = None
-    """Cut-off between sites; default: 9 Å in a periodic box, none without one"""
+    """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "switch"
-    """How Lennard-Jones and Coulomb forces end at the cut-off; smooth_switch suits integrators of high order. The
-    energy of a reaction field is first shifted to 0 there, then multiplied by switch or smooth_switch. The real-space
-    part of ewald and pme ends according to ewald_truncation"""
+    """Cutoff scheme of Lennard-Jones and Coulomb forces; smooth_switch suits integrators of high order. The energy of a
+    reaction field is first shifted to 0 at the cutoff, then multiplied by switch or smooth_switch. The real-space part
+    of ewald and pme follows ewald_truncation"""
     switch_start_A: Positive | None = None
-    """Where force_switch and switch begin; default: 1 Å before the cut-off, or at 0.9 of it if that is larger. Where
-    smooth_switch begins; default: at 0.6 of the cut-off"""
+    """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that is larger. Where
+    smooth_switch begins; default: at 0.6 of the cutoff"""
     lennard_jones: Flag = True
-    """Whether Lennard-Jones sites act; false where `custom` takes their place"""
+    """Whether Lennard-Jones sites interact; false where `custom` replaces Lennard-Jones forces"""
     mixing: Mixing = "lorentz-berthelot"
-    """Lennard-Jones parameters between unlike sites"""
+    """Mixing rule of Lennard-Jones parameters between unlike sites"""
     pairs: tuple[UnlikePair, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Parameters of particular pairs, in place of the mixing rule"""
+    """Lennard-Jones parameters of particular pairs, in place of the mixing rule"""
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Forces of one's own"""
+    """Custom forces"""
     tail_correction: Flag = False
-    """Add the energy and pressure of Lennard-Jones beyond the cut-off; `pressure` includes it, `virial` does not"""
+    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not"""
     electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
-    """Coulomb forces: ewald and pme act on all periodic images, the others within the cut-off; none ignores charges"""
+    """Coulomb forces: ewald and pme act on all periodic images, the others within the cutoff; none ignores charges"""
     reaction_field_permittivity: Permittivity = inf
-    """Permittivity of the continuum beyond the cut-off; inf for a conductor"""
+    """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
-    """Of damped_shifted_force; 0 for none"""
+    """Damping of damped_shifted_force; 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
     """Of ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets the
     keys below; default: 1e-5"""
@@ -149,16 +150,16 @@ class Forces(Section):
     ewald_k_radius_per_A: Positive | None = None
     """Of ewald: largest length of k"""
     ewald_truncation: Literal["plain", "shift"] | None = None
-    """Of ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cut-off; forces are the
+    """Of ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cutoff, forces are the
     same. Default: plain if `truncation` is plain, else shift. With shift, coulomb_self also includes
-    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cut-off R, which is 0 for neutral ones"""
+    -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0 for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """Of pme: order of the B-splines; 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """Of pme: grid points along each edge of the cell of box or file; three equal numbers if it leans by more than half
-    an edge, because an equivalent cell replaces it then"""
+    """Of pme: grid points along each edge of the cell of box or file; three equal numbers if its tilt is more than half
+    an edge, because an equivalent cell then replaces it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 
@@ -171,15 +172,15 @@ class Forces(Section):
             if getattr(self, key) != fields[key].default and method not in methods:
                 raise ValueError(f"{key} would do nothing with electrostatics = {method!r}")
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
-            raise ValueError("ewald_k2_max needs ewald_k_max beside it")
+            raise ValueError("ewald_k2_max needs ewald_k_max too")
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
             raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
-        settled = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
-        if settled and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
-            raise ValueError("ewald_accuracy would do nothing: alpha and the waves are given")
+        determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
+        if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
+            raise ValueError("ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given")
         return self
 
     @property
     def sets_k_vectors(self) -> bool:
-        """Whether the scene sets the waves of an Ewald sum."""
+        """Whether the scene sets the k-vectors of an Ewald sum."""
         return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None

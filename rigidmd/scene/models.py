@@ -1,4 +1,4 @@
-"""Rigid molecules: from a list of sites to a body in its principal frame. `models/*.toml` holds published models."""
+"""Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has published ones."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,27 +19,25 @@ from rigidmd.scene.validation import (
     Positive,
     Section,
     Vector,
-    validation_messages,
     did_you_mean,
-    numbers_out_of_range,
     location_of,
-)
+    numbers_out_of_range,
+    validation_messages,
+)  # fmt: skip
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
 MODELS = Path(__file__).parent.parent / "models"
-#: Absolute values of the numbers of molecules, in Å, u, e, kJ/mol, ps, unless they are 0: products of a few are finite.
+#: Smallest and largest absolute value of numbers of molecules other than 0, in Å, u, e, kJ/mol, ps: products of a few
+#: are finite.
 SIZES = (1e-30, 1e30)
-
-#: Of one rigid molecule.
+#: Largest number of sites of a molecule.
 MOST_SITES = 5000
 #: Two sites closer than this fraction of the molecule's size count as coinciding.
 COINCIDENT = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
 OFF_AXIS = 1e-4
-MOST_PARAMETERS = 100  # of one site
-
-
-#: Keys of a site of which both or none are given.
+MOST_PARAMETERS = 100  # of a site
+#: Keys of the well depth, of which a Lennard-Jones site has one; it also has sigma_A.
 DEPTHS = ("epsilon_kJ_mol", "epsilon_kcal_mol", "epsilon_K")
 LENNARD_JONES = ("sigma_A", *DEPTHS)
 
@@ -55,9 +53,9 @@ class Site(Section):
     element: str = "X"
     """Chemical symbol; X for a site without mass"""
     mass_u: NonNegative | None = None
-    """Mass; 0 for a massless site. With `file` the default follows from the element"""
+    """Mass; 0 for a massless site. Default with `file`: the mass of the element"""
     position_A: Vector | None = None
-    """Position in any frame fixed in the molecule; with `file` it is taken from there"""
+    """Position in any frame fixed in the molecule; default with `file`: the position there"""
     charge_e: Number | None = None
     """Charge in elementary charges"""
     sigma_A: Positive | None = None
@@ -67,9 +65,9 @@ class Site(Section):
     epsilon_kcal_mol: NonNegative | None = None
     """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
-    """Lennard-Jones well depth over Boltzmann's constant"""
+    """Lennard-Jones well depth divided by Boltzmann's constant"""
     parameters: dict[str, Number] = Field(default={}, max_length=MOST_PARAMETERS)
-    """Numbers for pair laws of one's own, by their names"""
+    """Parameters of custom pair potentials, by name"""
 
     @model_validator(mode="after")
     def _lennard_jones_is_whole(self):
@@ -111,7 +109,7 @@ class MoleculeFile(Section):
 
 
 class ParameterFile(Section):
-    """A table of parameters that several molecules may share; the key `parameters` of a scene names it."""
+    """A table of parameters for several molecules; the key `parameters` of a scene names it."""
 
     title: str = ""
     source: str = ""
@@ -124,7 +122,7 @@ class Molecule:
     """A rigid molecule in its principal frame, centre of mass at the origin.
 
     masses (s,) u, positions_body (s, 3) Å, charges (s,) e, sigma (s,) Å, epsilon (s,) u Å²/ps²; inertia (3,) u Å²,
-    ascending; 0 about an axis on which the whole mass lies.
+    ascending, 0 about an axis on which the whole mass lies.
     """
 
     name: str
@@ -144,19 +142,18 @@ class Molecule:
     group: str = "other"
     note: str = ""
     mixing: Mixing | None = None
-    parameters: tuple[dict[str, float], ...] = ()  # of each site, for pair laws of users
+    parameters: tuple[dict[str, float], ...] = ()  # of each site, for custom pair potentials
 
     def __repr__(self) -> str:
         return f"<Molecule {self.name}: {self.description}>"
 
     @property
     def fingerprint(self) -> tuple[float, ...]:
-        """Mass, u, moments of inertia, u Å², and number of sites (5,): by them a saved state knows its model."""
+        """Mass, u, moments of inertia, u Å², and number of sites (5,), by which a saved state is checked."""
         return (self.mass, *map(float, self.inertia), float(len(self.masses)))
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Degrees of freedom: three of translation and those of rotation."""
         return 3 + rotational_freedom(self.kind)
 
     @property
@@ -172,7 +169,7 @@ class Molecule:
 
     @property
     def has_dipole(self) -> bool:
-        """Whether the dipole moment about the centre of mass is more than rounding."""
+        """Whether the dipole moment about the centre of mass is more than a rounding error."""
         scale = COINCIDENT * self.radius * np.abs(self.charges).sum()
         return bool(self.dipole_debye * DEBYE > scale)
 
@@ -194,7 +191,7 @@ class Molecule:
 
     @property
     def description(self) -> str:
-        """Kind of body, sites, mass, charge and dipole in words."""
+        """Kind of body, number of sites, mass, charge and dipole, for reports."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
         charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
         dipole = ""
@@ -233,10 +230,7 @@ def _counted(number: int, noun: str) -> str:
 def molecule(
     name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
 ) -> Molecule:
-    """The rigid body of these sites, each of which needs a position and a mass.
-
-    Raises MoleculeError with all faults.
-    """
+    """The rigid body of these sites, each of which needs a position and a mass. Raises MoleculeError."""
     faults = [
         f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
     ]
@@ -291,28 +285,23 @@ def molecule(
 
 
 def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
-    """The same molecule with other masses (u) of sites (isotopes), keyed by site name or else element.
-
-    Raises MoleculeError.
-    """
+    """The same molecule with other masses (u) of isotopes, by site name or else element. Raises MoleculeError."""
     faults, changed = [], {}
     for key, mass in masses.items():
-        places = [i for i, name in enumerate(found.site_names) if name == key] or [
+        sites = [i for i, name in enumerate(found.site_names) if name == key] or [
             i for i, element in enumerate(found.elements) if element == key
         ]
-        heavy = [i for i in places if found.masses[i] > 0]
+        heavy = [i for i in sites if found.masses[i] > 0]
         if not heavy:
-            known = dict.fromkeys([*found.elements, *found.site_names])
-            why = (
-                "is massless, and stays so" if places else f"is no site or element of it; there are {', '.join(known)}"
-            )
+            known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
+            why = "is massless, and stays so" if sites else f"is not a site or element of it; there are {known}"
             faults.append(f"masses_u.{key} {why}")
         changed |= {i: mass for i in heavy if i not in changed or found.site_names[i] == key}
     if faults:
         raise MoleculeError(f"molecule {found.name}", faults)
     sites = [Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])}) for i, entry in enumerate(found.sites())]
-    again = molecule(found.name, tuple(sites), found.title, found.source, found.residue_names)
-    return replace(again, group=found.group, note=found.note, mixing=found.mixing)
+    made = molecule(found.name, tuple(sites), found.title, found.source, found.residue_names)
+    return replace(made, group=found.group, note=found.note, mixing=found.mixing)
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -330,22 +319,22 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
 
 
 def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
-    """values[k] (own, ...) of each molecule of species k, one molecule after the other; species (n,)."""
-    counts = np.array([len(own) for own in values])
-    begin, own = np.cumsum(counts) - counts, counts[species]
-    rows = np.repeat(begin[species] - np.cumsum(own) + own, own)
+    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order; species (n,)."""
+    sizes = np.array([len(array) for array in values])
+    begin, count = np.cumsum(sizes) - sizes, sizes[species]
+    rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
     rows += np.arange(len(rows))
     return np.concatenate(values)[rows]
 
 
 def sites_named(species: list[Molecule], name: str) -> list[np.ndarray]:
-    """Which sites of each species a name means: those of this name, or else of this element; SPECIES.NAME of one."""
-    owner, _, own = name.rpartition(".")
-    for of_molecule in ("site_names", "elements"):
+    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one species."""
+    owner, _, site = name.rpartition(".")
+    for attribute in ("site_names", "elements"):
         found = [
-            np.array([owner in ("", m.name) and other == own for other in getattr(m, of_molecule)]) for m in species
+            np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)]) for m in species
         ]
-        if any(of.any() for of in found):
+        if any(mask.any() for mask in found):
             break
     return found
 
@@ -367,7 +356,7 @@ def _shipped() -> tuple[str, ...]:
 
 @cache
 def model_fault(name: str) -> str:
-    """Message that there is no model of this name; empty if there is one."""
+    """The message on an unknown model; empty for a known one."""
     known = available_models()
     if name in known:
         return ""
@@ -388,12 +377,7 @@ def read_molecule(path: Path) -> Molecule:
     return replace(found, group=data.group, note=data.note, mixing=data.mixing)
 
 
-def read_parameters(path: Path) -> tuple[Site, ...]:
-    """The entries of a table of parameters. Raises MoleculeError."""
-    return read_table(path).sites
-
-
-def read_table(path: Path) -> ParameterFile:
+def read_parameters(path: Path) -> ParameterFile:
     """A table of parameters. Raises MoleculeError."""
     table = _read(path, ParameterFile)
     entries = table.sites
@@ -409,12 +393,8 @@ Table = TypeVar("Table", bound=Section)
 
 
 def _read(path: Path, kind: type[Table]) -> Table:
-    """A file read as this kind of table. Raises MoleculeError."""
     data, text = read_toml(path, MoleculeError)
-    wrong = impossible_values(data)
-    if not wrong:
-        wrong = numbers_out_of_range(data, *SIZES)
-    if wrong:
+    if wrong := impossible_values(data) or numbers_out_of_range(data, *SIZES):
         raise MoleculeError(str(path), [f"{location_of(keys, text)}: {fault}" for keys, fault in wrong])
     try:
         return kind.model_validate(data)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
+from typing import Annotated, Any, ClassVar, Literal, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 
@@ -16,14 +16,11 @@ from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.start import TOPOLOGY_NAMES, NAMELESS, Box, Start, Structure
+from rigidmd.scene.start import NAMELESS, TOPOLOGY_NAMES, Box, Start, Structure
 from rigidmd.scene.user_code import UserCode, missing_user_code
 from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
 
-if TYPE_CHECKING:
-    pass
-
-#: Name of the structure file of a scene that holds atoms.
+#: Name of the structure file of a scene made from `ase.Atoms`.
 STRUCTURE_NAME = "atoms.xyz"
 TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb")
 WITH_VELOCITIES = (".trr", ".nc", ".gsd", ".traj")
@@ -38,7 +35,7 @@ class RunSettings(Section):
 
     remove_momentum_interval_ps: Interval | Literal[False] | None = None
     """Time between removals of the total momentum; false for never. Default: 1 ps with pme, whose forces do not add up
-    to zero exactly, else never. The energy removed is booked like the heat of a thermostat"""
+    to zero exactly, else never. The energy removed counts as heat, as with a thermostat"""
 
 
 class Output(Section):
@@ -49,24 +46,24 @@ class Output(Section):
     pressure_tensor: Flag = False
     """Write the six components of the pressure into log.csv"""
     pressure_tensor_interval_ps: Interval | Literal[False] = False
-    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line takes an
+    """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line needs an
     evaluation of forces with the virial"""
     trajectory: str | Literal[False] = "trajectory.xtc"
-    """Trajectory file; the ending sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd keeps rotations and
-    angular momenta, .traj is ASE's and has double precision; false for none"""
+    """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd stores rotations
+    and angular momenta, .traj is ASE's and has double precision; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
     topology: str = "topology.gro"
-    """File with names and first positions that viewers need beside the trajectory (.gro or .pdb)"""
+    """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
     """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box. Molecules are whole in
-    both"""
+    both cases"""
     velocities: Flag | None = None
-    """Write velocities; default: if the format holds them"""
+    """Write velocities; default: true if the format can store them"""
     figures: Flag = True
     """Draw energy.png"""
     checkpoint_minutes: Minutes = 5.0
-    """Wall time between checkpoints, from which a run goes on after a stop; false for none"""
+    """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none"""
 
     @field_validator("trajectory")
     @classmethod
@@ -79,19 +76,19 @@ class Output(Section):
         return file_name(name, TOPOLOGY_FORMATS)
 
     @model_validator(mode="after")
-    def _holds_velocities(self):
+    def _files_are_consistent(self):
         if self.velocities and (self.trajectory is False or not self.trajectory.endswith(WITH_VELOCITIES)):
             raise ValueError(
-                f"velocities = true, but {self.trajectory or 'no trajectory'} holds none; "
+                f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; "
                 f"use one ending in {' or '.join(WITH_VELOCITIES)}"
             )
         if self.topology == self.trajectory:
-            raise ValueError(f"topology and trajectory are both {self.topology}; name them apart")
+            raise ValueError(f"topology and trajectory are both {self.topology}; give them different names")
         return self
 
 
 class Settings(TypedDict, total=False):
-    """Keywords of `Scene.from_atoms`: the tables and keys of a scene file, but for [[molecules]]."""
+    """Keywords of `scene_from_atoms`: the tables and keys of a scene file except [[molecules]]."""
 
     name: str
     seed: int
@@ -132,37 +129,39 @@ class MolecularScene(Scene):
     output: Output = Output()
     watch: Watch = Watch()
     from_python: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
-    """Set by a run from Python: names of forces and a thermostat that it was given and a scene cannot hold. Such a
-    scene runs only from Python, with the same ones"""
+    """Names of forces and a thermostat that Python added, set by the run. Such a scene runs only from Python, with the
+    same forces and thermostat"""
 
     _user_code: UserCode = PrivateAttr(UserCode())
 
     @property
     def user_code(self) -> UserCode:
-        """What Python has added."""
+        """The forces and the thermostat that Python added."""
         return self._user_code
 
     def with_user_code(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
-        user_code = UserCode((*self._user_code.forces, *forces), thermostat if thermostat is not None else self._user_code.thermostat)
+        user_code = UserCode(
+            (*self._user_code.forces, *forces), thermostat if thermostat is not None else self._user_code.thermostat
+        )
         if self.from_python not in ((), user_code.names):
             raise SceneError(self.source, [missing_user_code(self.from_python, user_code.names)])
         scene = self.model_copy(update={"from_python": user_code.names})
         scene._user_code = user_code
         return scene
 
-    def with_end(self, until: float) -> "MolecularScene":
+    def with_end(self, time: float) -> "MolecularScene":
         """The same scene with a last stage that ends at a time of the run, ps. Raises SceneError."""
         before = sum(stage.duration for stage in self.stages[:-1])
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:
             what = "is a minimisation" if last.is_minimisation else "changes temperature or pressure over its duration"
             raise SceneError(self.source, [f"the last stage {what}: --until cannot set its end"])
-        if not until > before:
-            raise SceneError(self.source, [f"--until {until:g} ps: the last stage begins at {before:g} ps"])
-        if not (until - before) * 1000 / last.timestep_fs < MOST_STEPS:
-            raise SceneError(self.source, [f"--until {until:g} ps is more than {MOST_STEPS:g} steps away"])
-        stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": until - before}))
+        if not time > before:
+            raise SceneError(self.source, [f"--until {time:g} ps: the last stage begins at {before:g} ps"])
+        if not (time - before) * 1000 / last.timestep_fs < MOST_STEPS:
+            raise SceneError(self.source, [f"--until {time:g} ps is more than {MOST_STEPS:g} steps away"])
+        stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": time - before}))
         return self.model_copy(update={"stages": stages})
 
     @property
@@ -177,7 +176,7 @@ class MolecularScene(Scene):
 
     @property
     def first_moving(self) -> Stage | None:
-        """The first stage in which time passes, if there is one."""
+        """The first stage that is not a minimisation, if there is one."""
         return next((stage for stage in self.stages if not stage.is_minimisation), None)
 
     @property
@@ -198,19 +197,19 @@ class MolecularScene(Scene):
 
     @property
     def structure_source(self) -> str:
-        """Where the atoms of the start come from, for messages; empty without a structure."""
+        """Path of the structure file, or "atoms", for messages; empty without a structure."""
         if self.structure is None:
             return ""
         return "atoms" if "structure.file" in self.embedded_files else str(self.path(self.structure.file))
 
     @property
     def topology(self) -> str | None:
-        """The file with the names of atoms that a trajectory as structure lacks, as the scene would name it."""
+        """The topology file of a trajectory as structure: as given, or else as found in the trajectory's folder."""
         start = self.structure
         if start is None or start.topology is not None or not start.file.lower().endswith(NAMELESS):
             return None if start is None else start.topology
-        beside = [str(Path(start.file).with_name(name)) for name in TOPOLOGY_NAMES]
-        return next((name for name in beside if self.path(name).is_file()), None)
+        candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGY_NAMES]
+        return next((name for name in candidates if self.path(name).is_file()), None)
 
     def _faults(self):
         if self.structure is None:
@@ -240,9 +239,7 @@ class MolecularScene(Scene):
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
-            yield (
-                "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
-            )
+            yield "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
@@ -250,7 +247,7 @@ class MolecularScene(Scene):
         yield from self._uneven_frames()
 
     def _barostat_faults(self) -> list[str]:
-        """Faults of stages with a barostat."""
+        """Messages on stages with a barostat."""
         faults = []
         for k, stage in enumerate(self.stages):
             if not stage.changes_box:
@@ -268,7 +265,7 @@ class MolecularScene(Scene):
         return faults
 
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
-        """A sentence for each interval and duration that is not a whole number of steps, of all stages or these."""
+        """Notes on intervals and durations that are not a whole number of steps, of all stages or these."""
         output, found = self.output, {}
         of_run = [
             ("output.log_interval_ps", output.log_interval_ps),
@@ -291,7 +288,7 @@ class MolecularScene(Scene):
         ]
 
     def _uneven_frames(self) -> list[str]:
-        """DCD stores one interval for all frames: stages that would make them uneven."""
+        """Messages on stages with other intervals between frames: a DCD file has one interval for all frames."""
         if not self.output.trajectory or not self.output.trajectory.endswith(".dcd"):
             return []
         wanted = self.output.trajectory_interval_ps
@@ -313,7 +310,6 @@ class MolecularScene(Scene):
 
     @classmethod
     def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        """Files of a scene that lie outside its folder."""
         named = []
         if isinstance(structure := data.get("structure"), dict):
             named += [(f"structure.{key}", structure.get(key)) for key in ("file", "topology")]
@@ -332,14 +328,14 @@ class MolecularScene(Scene):
                 if isinstance(entry, dict)
             ]
         return [
-            f"{key}: {shorten_repr(file)} lies outside the scene's folder; move it there, or name it with --set {key}=PATH"
+            f"{key}: {shorten_repr(file)} is outside the scene's folder; move it there, or set it by --set {key}=PATH"
             for key, file in named
             if isinstance(file, str) and not _is_inside(folder / file, folder)
         ]
 
 
 def _is_inside(path: Path, folder: Path) -> bool:
-    """Whether a path leads to a place in a folder. True for what leads nowhere, which is found missing later."""
+    """Whether a path is inside a folder. True for a path that cannot be resolved, which is missing."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):  # a name that is too long, a loop of links, a zero byte

@@ -1,4 +1,4 @@
-"""Shipped with the package: example scenes, notebooks, scripts and the chapters of the documentation."""
+"""Files that are shipped with the package: example scenes, notebooks, scripts, chapters of the documentation."""
 
 import difflib
 import json
@@ -15,33 +15,20 @@ from rigidmd.errors import InputError, OutputError
 
 PACKAGE = Path(__file__).parent.parent
 
-#: In a wheel the scenes are inside the package; in a checkout or an editable install they are beside it.
+#: In a wheel the scenes are inside the package; in a checkout or an editable install they are next to it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
 NOTEBOOK, SCRIPT = ".ipynb", ".py"
-#: Shipped files in the chapters: stem, ending.
+#: Shipped files in the chapters: stem, extension.
 _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
-#: What an example is, by the ending of its file.
+#: Kind of an example by the extension of its file.
 KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
 
 #: In the order of the list.
 CHAPTERS = (
-    "top",
-    "water",
-    "molecule",
-    "ensembles",
-    "looking",
-    "notebook",
-    "measuring",
-    "studies",
-    "ase",
-    "engines",
-    "extending",
-    "manual",
-    "benchmarks",
-    "validation",
-    "changelog",
-)
+    "top", "water", "molecule", "ensembles", "looking", "notebook", "measuring", "studies", "ase", "engines",
+    "extending", "manual", "benchmarks", "validation", "changelog",
+)  # fmt: skip
 
 
 class Example(NamedTuple):
@@ -54,7 +41,6 @@ class Example(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """scene, notebook or script."""
         return KINDS[self.path.suffix]
 
 
@@ -86,7 +72,7 @@ def scripts() -> list[Example]:
 
 
 def _natural_order(example: Example) -> list:
-    """Sort key in which numbers within a name count as numbers."""
+    """Sort key that orders numbers within names by value."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
 
 
@@ -105,12 +91,12 @@ def find_example(name: str) -> Example:
 
 
 def series_of(name: str) -> list[str]:
-    """The scenes NAME_1, NAME_2, ...; empty if there is no such series."""
+    """The scenes NAME_1, NAME_2, ...; empty if there are none."""
     return [example.name for example in examples() if re.fullmatch(rf"{re.escape(name)}_\d+", example.name)]
 
 
 def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path] = ()) -> list[Path]:
-    """Copy an example to `path` and the files that it reads beside it; the paths written. Raises OutputError."""
+    """Copy an example to `path`, with the files that it reads. Returns the paths written. Raises OutputError."""
     if path.suffix != example.path.suffix:
         raise OutputError(f"{path} must end in {example.path.suffix}: name a file for the {example.kind} with -o")
     inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
@@ -131,7 +117,7 @@ def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path]
 
 
 def contents() -> dict[str, str]:
-    """Chapters of the documentation: name -> what it is about, the first line under its title."""
+    """Chapters of the documentation: name -> subject, the first line under its title."""
     return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
 
 
@@ -149,20 +135,20 @@ def chapter_text(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """The text of a chapter. Shipped files, which lie elsewhere in a wheel, are named as `rigidmd new` copies them."""
+    """The text of a chapter. Shipped files are named as `rigidmd new` copies them, not by their paths."""
     text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
     text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
     copied = sorted(set(_SHIPPED.findall(text)))
     title, _, text = text.partition("\n")
     if copied:
-        files = textwrap.fill(", ".join(f"{stem}{ending}" for stem, ending in copied), 120)
+        files = textwrap.fill(", ".join(f"{stem}{extension}" for stem, extension in copied), 120)
         title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
     text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", _picture, _SHIPPED.sub(r"\1\2", text))
     return f"{title}\n{text}".rstrip()
 
 
 def _picture(found: re.Match) -> str:
-    """A picture as plain text: its name, and its path where it is there."""
+    """A picture as plain text: its name, and its path if the file exists."""
     about, up, path = found.groups()
     there = (DOCS / up / path).is_file()
     return f"[picture: {about}{f', {path}' if there else ''}]"

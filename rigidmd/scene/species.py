@@ -1,4 +1,4 @@
-"""Tables of a scene of molecules: species."""
+"""The tables [[molecules]] of a scene: species and their numbers of molecules."""
 
 import re
 from pathlib import Path
@@ -23,12 +23,12 @@ class Molecules(Section):
     file: Line | None = None
     """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with `sites` for its atoms"""
     name: Line | None = None
-    """Name of the species; default: that of the model or file"""
+    """Name of the species; default: the name of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
-    """Sites of your own molecule; with a geometry `file`, their parameters by atom name or element"""
+    """Sites of a custom molecule; with a geometry `file`, their parameters by atom name or element"""
     parameters: Line | None = None
-    """A .toml file with entries like those of `sites`, which several molecules may share. It supplies missing keys by
-    atom name or element"""
+    """A .toml file with entries like `sites` that several molecules may use. It supplies missing keys by atom name or
+    element"""
     masses_u: dict[str, Positive] | None = Field(default=None, min_length=1)
     """Masses of sites by name or element, for other isotopes: { H = 2.014 } for heavy water"""
     residue_names: tuple[SiteName, ...] | None = None
@@ -36,9 +36,9 @@ class Molecules(Section):
     count: Count | None = None
     """Number of molecules; required without a structure file"""
     frozen: Flag | tuple[ResidueNumber, ...] | str = False
-    """They stay put and act on the others; not on one another, so the potential energy lacks that constant. True for
-    all, or numbers of some, [1, 2, 5] or "1-10, 15": all residues of such a number in the structure file; where its
-    residues are not the molecules, or there is no file, 1, 2, ... among those of this species"""
+    """Molecules that do not move. They act on all others but not on each other. True for all, or numbers of some,
+    [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, if there is no file or its residues are not the
+    molecules, 1, 2, ... within this species"""
 
     @field_validator("frozen")
     @classmethod
@@ -47,7 +47,7 @@ class Molecules(Section):
 
     @property
     def frozen_spans(self) -> list[tuple[int, int]]:
-        """First and last of the numbers of frozen molecules; none where all or none are."""
+        """Ranges (first, last) of the numbers of frozen molecules; empty if all or none are frozen."""
         return [] if isinstance(self.frozen, bool) else spans(self.frozen)
 
     @field_validator("model")
@@ -60,10 +60,10 @@ class Molecules(Section):
     @model_validator(mode="after")
     def _one_source(self):
         if self.model is not None and (self.file is not None or self.sites is not None):
-            raise ValueError("give a model, or a file and sites of your own, not both")
+            raise ValueError("give a model, or a custom file and sites, not both")
         whole = self.model is not None or (self.file is not None and self.file.endswith(".toml"))
         if self.parameters is not None and whole:
-            raise ValueError("parameters would do nothing: a model or a .toml file has its own")
+            raise ValueError("parameters would do nothing: a model or a .toml file contains parameters")
         if self.parameters is not None and not self.parameters.endswith(".toml"):
             raise ValueError(f"parameters = {self.parameters!r} must be a .toml file with [[sites]]")
         if self.model is None and self.file is None and self.sites is None:
@@ -73,29 +73,29 @@ class Molecules(Section):
         if self.file is not None and not whole and self.sites is None and self.parameters is None:
             raise ValueError("a geometry file needs sites, or a file of parameters, for its atoms")
         if self.sites is not None and self.file is None and self.name is None:
-            raise ValueError("your own molecule needs a name")
+            raise ValueError("a custom molecule needs a name")
         return self
 
     @property
     def label(self) -> str:
-        """Its name, else that of its model or file."""
+        """The name, else the name of the model or file."""
         return self.name or self.model or Path(self.file or "").stem
 
 
 def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
-    """Numbers of molecules, [1, 2, 5] or "1-10, 15", as they are. Raises ValueError."""
+    """Numbers of molecules, [1, 2, 5] or "1-10, 15", unchanged. Raises ValueError."""
     if numbers == ():
         raise ValueError("is empty: list the numbers of molecules, or omit it")
     if isinstance(numbers, str):
         if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
             raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
-        if turned := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
-            raise ValueError(f"is {numbers!r}: {', '.join(turned)} ends before it begins")
+        if reversed_ := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
+            raise ValueError(f"is {numbers!r}: {', '.join(reversed_)} ends before it begins")
     return numbers
 
 
 def spans(numbers: tuple[int, ...] | str) -> list[tuple[int, int]]:
-    """First and last number of each part of "1-10, 15"; of a list, each number as both."""
+    """Ranges (first, last) of "1-10, 15", or of the single numbers of a list."""
     if not isinstance(numbers, str):
         return [(number, number) for number in numbers]
     ends = [[int(number) for number in part.split("-")] for part in numbers.split(",")]

@@ -1,4 +1,4 @@
-"""Tables of a scene of molecules: stages, each with one ensemble and one time step, or a minimisation."""
+"""The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a minimisation."""
 
 from typing import Annotated, Any, Literal
 
@@ -20,16 +20,16 @@ Six = tuple[float, float, float, float, float, float]
 THERMOSTAT_TIMES = {"velocity_rescaling": 0.1, "nose_hoover": 0.5, "andersen": 1.0}
 FRICTION = 1.0  # 1/ps
 BAROSTAT_TIME = 1.0  # ps
-#: A move of the box comes every so many parts of barostat_time_ps.
+#: Moves of the box per barostat_time_ps.
 MOVES_PER_TIME = 20
-#: Of water at 298 K and 1 bar, 1/bar.
+#: Compressibility of water at 298 K and 1 bar, 1/bar.
 COMPRESSIBILITY = 4.5e-5
 
 #: Ensembles in which time passes.
 MOVING = {"nve", "nvt", "npt", "nph"}
-#: In USED, a minimisation in which the cell relaxes.
+#: Stands in USED for a minimisation in which the cell relaxes.
 CELL = "minimise with a cell"
-#: Ensembles, thermostats and barostats under which each key does something.
+#: Key -> the ensembles, thermostats and barostats that use it.
 USED = {
     "duration_ps": MOVING,
     "timestep_fs": MOVING,
@@ -53,17 +53,17 @@ USED = {
     "most_iterations": {"minimise"},
 }
 
-#: What may be asked of the integrator and step that are left to a pilot.
+#: Keys of errors for which integrator = "auto" chooses the integrator and the step.
 ERROR_TARGETS = ("energy_error_kT", "trajectory_error", "bias_kT")
 
-#: Names from other programs -> advice.
+#: Names of methods in other programs -> advice.
 REFUSED = {
     "berendsen": "'berendsen' samples no ensemble: its fluctuations are too small and heat flows into the slowest "
     "motions",
     "parrinello_rahman": "Parrinello-Rahman is not available; cell_rescaling samples the same ensemble",
     "mttk": "MTTK is not available; cell_rescaling samples the same ensemble",
-    "c_rescale": "C-rescale is called cell_rescaling here",
-    "v_rescale": "V-rescale is called velocity_rescaling here",
+    "c_rescale": "C-rescale is called cell_rescaling in rigidmd",
+    "v_rescale": "V-rescale is called velocity_rescaling in rigidmd",
 }
 
 
@@ -71,45 +71,44 @@ class Stage(Section):
     """A part of a run with one ensemble and one time step."""
 
     name: Line | None = None
-    """Name of the stage; default: that of the ensemble"""
+    """Name of the stage; default: the name of the ensemble"""
     ensemble: Ensemble = "nve"
     """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and
-    pressure. minimise: no time passes; molecules move and turn to a minimum of the potential energy, or of the enthalpy
-    if pressure_bar is given, with the cell"""
+    pressure. minimise: no time passes; molecules move and rotate to a minimum of the potential energy, or, if
+    pressure_bar is given, molecules and cell to a minimum of the enthalpy"""
     duration_ps: Positive | None = Field(default=None, validate_default=True)
-    """How long; required except with minimise"""
+    """Duration; required except with minimise"""
     timestep_fs: Positive = 2.0
     """Time step"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
     thermostat: Thermostat | None = None
-    """velocity_rescaling: the stochastic one of Bussi et al.; langevin: friction and noise; nose_hoover: one chain for
-    translation and one for rotation; andersen: collisions. Default: langevin with baoab, else
-    velocity_rescaling"""
+    """velocity_rescaling: stochastic, by Bussi et al.; langevin: friction and noise; nose_hoover: one chain for
+    translation and one for rotation; andersen: collisions. Default: langevin with baoab, else velocity_rescaling"""
     thermostat_time_ps: Positive | None = None
     """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or mean time between two
     collisions of a molecule with andersen (1 ps)"""
     friction_translation_per_ps: Positive | None = None
-    """Of langevin, on translation; default: 1"""
+    """Friction of langevin on translation; default: 1"""
     friction_rotation_per_ps: Positive | None = None
-    """Of langevin, on rotation; default: that on translation"""
+    """Friction of langevin on rotation; default: friction_translation_per_ps"""
     nose_hoover_links: Links = 3
     """Links of each Nose-Hoover chain"""
     pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat, or at which minimise relaxes the cell; two for a linear change over the stage,
+    """Pressure of the barostat, or of the minimisation of the enthalpy; two for a linear change over the stage,
     [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
     pressure_coupling: Coupling = "isotropic"
-    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z apart; anisotropic: three
-    edges; flexible: edges and angles"""
+    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z separately; anisotropic:
+    three edges; flexible: edges and angles"""
     barostat: Barostat | None = None
-    """Of npt. cell_rescaling: stochastic cell rescaling, made exact by a Metropolis test, when not given; monte_carlo:
-    random changes of the volume. nph has a piston without friction"""
+    """Barostat of npt. cell_rescaling: stochastic cell rescaling, made exact by a Metropolis test; monte_carlo: random
+    changes of the volume. Default: cell_rescaling. nph has a piston without friction"""
     barostat_time_ps: Positive | None = None
     """Time constant of cell_rescaling, period of the piston of nph; default: 1 ps"""
     barostat_interval_ps: Positive | None = None
-    """Of npt, time between two moves of the box; default: 0.05 of barostat_time_ps"""
+    """Time between two moves of the box in npt; default: 0.05 of barostat_time_ps"""
     compressibility_per_bar: Positive | None = None
-    """Compressibility; it sets the speed of the box, not the ensemble. Default: that of water, 4.5e-5"""
+    """Compressibility; it sets the speed of the box, not the ensemble. Default: 4.5e-5, of water"""
     integrator: Literal[(*SCHEMES, *WITH_THERMOSTAT, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
     scheme and step that keep the requested error with the fewest force evaluations"""
@@ -118,26 +117,26 @@ class Stage(Section):
     trajectory_error: Positive | None = None
     """With auto: largest error of Q (for points of X in Å) at the end of the pilot run of ten radians of libration"""
     bias_kT: Positive | None = None
-    """With auto, of nvt: estimated bias of the average potential energy, in kT per degree of freedom"""
+    """With auto in nvt: estimated bias of the average potential energy, in kT per degree of freedom"""
     rotor: Rotor | None = None
-    """Free rotation by the split or the exact flow; default: the one that the integrator needs"""
+    """Free rotation by the split or the exact flow; default: the flow that the integrator needs"""
     force_limit_kJ_mol_A: Positive = 0.1
-    """Of minimise: largest force on a molecule at convergence. Forces in a liquid are of the order of 10 kJ/mol/Å, and
-    force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds): with 0.1 positions are good to 0.1 and 0.001 Å
-    and energies to 0.005 kJ/mol per molecule, 0.002 kT at 300 K"""
+    """With minimise: largest force on a molecule at convergence. Forces in a liquid are of the order of 10 kJ/mol/Å,
+    and force constants between 1 (argon) and 100 kJ/mol/Å² (hydrogen bonds): with 0.1 positions are good to 0.1 and
+    0.001 Å and energies to 0.005 kJ/mol per molecule, 0.002 kT at 300 K"""
     torque_limit_kJ_mol: Positive = 0.1
-    """Of minimise: largest torque on a molecule about a principal axis at convergence; for a molecule with a radius of
-    1 Å as strict as the default limit of forces"""
+    """With minimise: largest torque on a molecule about a principal axis at convergence; for a molecule with a radius
+    of 1 Å as strict as the default limit of forces"""
     pressure_limit_bar: Positive = 1.0
-    """Of minimise with pressure_bar: largest deviation from it at convergence. At the compressibility of water 1 bar
-    changes the volume by 5e-5"""
+    """With minimise and pressure_bar: largest deviation of the pressure at convergence. At the compressibility of water
+    1 bar changes the volume by 5e-5"""
     most_iterations: Count = 5000
-    """Of minimise: it stops after so many, with a warning if it has not converged"""
+    """With minimise: largest number of iterations, after which it stops with a warning"""
 
     @model_validator(mode="before")
     @classmethod
-    def _goes_together(cls, data: Any):
-        """Set langevin for baoab and baoab for langevin."""
+    def _langevin_and_baoab(cls, data: Any):
+        """Set langevin as the default with baoab, and baoab as the default with langevin."""
         if isinstance(data, dict) and data.get("ensemble") in ("nvt", "npt"):
             if data.get("thermostat") == "langevin" and "integrator" not in data:
                 return data | {"integrator": "baoab"}
@@ -147,15 +146,15 @@ class Stage(Section):
 
     @field_validator("thermostat", "barostat", mode="before")
     @classmethod
-    def _is_there(cls, name: Any):
-        asked = name.lower().replace("-", "_") if isinstance(name, str) else ""
-        if asked in REFUSED:
-            raise ValueError(f"{REFUSED[asked]}. There are {', '.join((*Thermostat.__args__, *Barostat.__args__))}")
+    def _is_available(cls, name: Any):
+        plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
+        if plain in REFUSED:
+            raise ValueError(f"{REFUSED[plain]}. There are {', '.join((*Thermostat.__args__, *Barostat.__args__))}")
         return name
 
     @field_validator("duration_ps")
     @classmethod
-    def _lasts(cls, duration: float | None, others: ValidationInfo):
+    def _has_duration(cls, duration: float | None, others: ValidationInfo):
         if duration is None and others.data.get("ensemble") != "minimise":
             raise ValueError("is missing")
         return duration
@@ -173,13 +172,11 @@ class Stage(Section):
             yield from self._pressure_faults()
         if fault := rotor_error(self.integrator, self.rotor):
             yield fault
-        with_integrator = [
-            key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default
-        ]
-        asked = {key: getattr(self, key) for key in ERROR_TARGETS}
-        yield from auto_errors(self.integrator, asked, with_integrator)
+        given = [key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default]
+        targets = {key: getattr(self, key) for key in ERROR_TARGETS}
+        yield from auto_errors(self.integrator, targets, given)
         if self.bias_kT is not None and not self.has_thermostat:
-            yield f"bias_kT is of averages at a temperature, and {self.ensemble} has no thermostat"
+            yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
         if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
@@ -190,12 +187,12 @@ class Stage(Section):
 
     @property
     def _parts(self) -> set[str]:
-        """Its ensemble, thermostat and barostat, and CELL where a minimisation relaxes the cell."""
+        """The ensemble, thermostat and barostat, and CELL where a minimisation relaxes the cell."""
         cell = {CELL} if self.is_minimisation and self.changes_box else set()
         return {self.ensemble, self.thermostat_kind, self.barostat_kind} | cell
 
     def _where(self, idle: list[str]) -> str:
-        """With which settings keys would do nothing, in words."""
+        """The settings with which keys would do nothing, for the message."""
         known = [USED[key] for key in idle]
         if self.is_minimisation:
             return "in a minimise stage" + (" without pressure_bar" if all(CELL in where for where in known) else "")
@@ -215,8 +212,8 @@ class Stage(Section):
             faults.append("pressure_bar: a minimum has one pressure, not one that changes")
         if self.integrator == AUTO:
             faults.append("integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure")
-        apart = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
-        if apart or (coupling == "isotropic" and several == 3):
+        unequal = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
+        if unequal or (coupling == "isotropic" and several == 3):
             faults.append(f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}")
         if several == 6 and coupling != "flexible":
             faults.append(f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}")
@@ -231,37 +228,35 @@ class Stage(Section):
 
     @property
     def steps(self) -> int:
-        """Number of steps: the duration in steps, rounded."""
         return round(self.duration * 1000 / self.timestep_fs)
 
     @property
     def duration(self) -> float:
-        """ps; 0 where no time passes."""
+        """Duration, ps; 0 for a minimisation."""
         return self.duration_ps or 0.0
 
     @property
     def is_minimisation(self) -> bool:
-        """Whether it is a minimisation, in which no time passes."""
         return self.ensemble == "minimise"
 
     @property
     def is_auto(self) -> bool:
-        """Whether integrator and step are still open."""
+        """Whether integrator and step are still to be chosen."""
         return self.integrator == AUTO
 
     @property
     def thermostat_is_open(self) -> bool:
-        """Whether the thermostat is chosen with the integrator: a bias is asked for, and nothing of a thermostat."""
+        """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a thermostat."""
         return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
 
     def with_integrator(self, integrator: str, timestep_fs: float) -> "Stage":
-        """This stage with the choice of pilot runs."""
+        """This stage with the integrator and step that pilot runs have chosen."""
         changes = {"integrator": integrator, "timestep_fs": timestep_fs}
         return self.model_copy(update=changes | dict.fromkeys(ERROR_TARGETS))
 
     @property
     def with_defaults(self) -> "Stage":
-        """This stage with every number that it uses."""
+        """This stage with the defaults of all keys that it uses."""
         found: dict[str, Any] = {}
         if self.has_thermostat and not self.thermostat_is_open:
             found |= {"thermostat": self.thermostat_kind}
@@ -285,17 +280,14 @@ class Stage(Section):
 
     @property
     def label(self) -> str:
-        """Its name, or its ensemble."""
         return self.name or self.ensemble
 
     @property
     def has_thermostat(self) -> bool:
-        """Whether its temperature is kept."""
         return self.ensemble in ("nvt", "npt")
 
     @property
     def has_barostat(self) -> bool:
-        """Whether its pressure is kept."""
         return self.ensemble in ("npt", "nph")
 
     @property
@@ -305,55 +297,53 @@ class Stage(Section):
 
     @property
     def thermostat_kind(self) -> str:
-        """Its thermostat; empty where it has none."""
+        """The thermostat, or an empty text."""
         return (self.thermostat or "velocity_rescaling") if self.has_thermostat else ""
 
     @property
     def barostat_kind(self) -> str:
-        """Its barostat; empty where it has none, and with nph, whose piston is the only one."""
+        """The barostat of npt, or an empty text."""
         return (self.barostat or "cell_rescaling") if self.ensemble == "npt" else ""
 
     @property
     def temperatures(self) -> tuple[float, float]:
-        """Temperature at its begin and its end, K; that of a stage with a thermostat."""
+        """Temperature of the thermostat at begin and end, K."""
         both = self.temperature_K
         return both if isinstance(both, tuple) else (both or 0.0, both or 0.0)
 
     @property
     def thermostat_time(self) -> float:
-        """Time constant of its thermostat, ps; of langevin the longer one."""
+        """Time constant of the thermostat, ps; the longer one of langevin."""
         if self.thermostat_kind == "langevin":
             return 1 / min(self.frictions)
         return self.thermostat_time_ps or THERMOSTAT_TIMES[self.thermostat_kind]
 
     @property
     def frictions(self) -> tuple[float, float]:
-        """On translation and rotation, 1/ps."""
+        """Friction on translation and rotation, 1/ps."""
         translation = self.friction_translation_per_ps or FRICTION
         return translation, self.friction_rotation_per_ps or translation
 
     @property
     def pressures(self) -> tuple[Six, Six]:
-        """At its begin and its end, bar: xx, yy, zz, xy, xz, yz."""
+        """Pressure at begin and end, bar: xx, yy, zz, xy, xz, yz."""
         given = self.pressure_bar
         ends = given if isinstance(given, tuple) and len(given) == 2 else (given, given)
         return _tensor(ends[0]), _tensor(ends[1])
 
     @property
     def ramps(self) -> bool:
-        """Whether its temperature or its pressure changes with time, so that its duration decides how fast."""
+        """Whether temperature or pressure changes over the duration."""
         first, last = self.temperatures
         begin, end = self.pressures if self.changes_box else ((), ())
         return first != last or begin != end
 
     @property
     def barostat_time(self) -> float:
-        """ps"""
         return self.barostat_time_ps or BAROSTAT_TIME
 
     @property
     def barostat_interval(self) -> float:
-        """Time between two moves of the box, ps."""
         return self.barostat_interval_ps or self.barostat_time / MOVES_PER_TIME
 
     @property
@@ -363,16 +353,15 @@ class Stage(Section):
 
     @property
     def compressibility(self) -> float:
-        """1/bar"""
         return self.compressibility_per_bar or COMPRESSIBILITY
 
     @property
     def keeps_momentum(self) -> bool:
-        """Whether its thermostat leaves the total momentum as it is."""
+        """Whether the thermostat conserves the total momentum."""
         return self.thermostat_kind not in ("langevin", "andersen")
 
 
 def _tensor(given: Any) -> Six:
-    """A pressure, three or six of them, as a tensor."""
+    """One, three or six pressures as a tensor."""
     values = given if isinstance(given, tuple) else (given,) * 3
     return (*values, 0.0, 0.0, 0.0) if len(values) == 3 else values

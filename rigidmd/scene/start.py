@@ -1,4 +1,4 @@
-"""Tables of a scene of molecules: positions at the start."""
+"""Tables [structure], [box] and [start] of a scene of molecules."""
 
 from math import cos, pi, radians, sqrt
 from typing import Annotated
@@ -9,12 +9,12 @@ from pydantic import Field, Strict, model_validator
 from rigidmd.scene.models import SiteName
 from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section
 
-#: Endings of LAMMPS' data files.
+#: Extensions of LAMMPS data files.
 LAMMPS_DATA = (".data", ".lmp", ".lammps")
-#: Endings of trajectories without names of atoms, and of those that have them.
+#: Extensions of trajectories without names of atoms, and of all trajectories.
 NAMELESS = (".xtc", ".trr", ".dcd", ".nc", ".ncdf")
 TRAJECTORIES = (*NAMELESS, ".gsd")
-#: What a topology beside a trajectory is called, as in the folder of a run.
+#: Names of topology files that are found next to a trajectory, as in the folder of a run.
 TOPOLOGY_NAMES = ("topology.gro", "topology.pdb")
 
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
@@ -25,43 +25,43 @@ class Structure(Section):
 
     file: Line
     """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, a trajectory (.xtc .trr
-    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; beside or below the scene"""
+    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; in the folder of the scene or below"""
     topology: Line | None = None
-    """Of a trajectory that has no names (all but .gsd): a structure file with the names of its atoms, in their order.
-    Default: topology.gro or topology.pdb beside it, as in the folder of a run"""
+    """Structure file with the names of the atoms, in the same order, for trajectories without names (all but .gsd).
+    Default: topology.gro or topology.pdb in the folder of the trajectory"""
     frame: Annotated[int, Strict()] | None = None
-    """Which of several structures in the file: 1 is the first, -1 the last; needed where there are several, but for
-    trajectories, whose default is the last"""
+    """Number of the structure in a file with several: 1 is the first, -1 the last. Required for such files, except
+    trajectories; default for trajectories: the last"""
     repeat: tuple[Count, Count, Count] = (1, 1, 1)
     """Repetitions of the file's cell along a, b, c, to make a crystal of its unit cell"""
     velocities: Flag = False
     """Use the velocities in the file instead of drawing them"""
     tolerance: Annotated[float, Strict(), Field(gt=0, lt=1)] = 0.15
-    """Largest distance of an atom from its rigid template, as a fraction of the template's radius"""
+    """Largest distance of an atom from its position in the rigid template, as a fraction of the template's radius"""
     atom_types: dict[str, SiteName] | None = Field(default=None, min_length=1)
-    """Of LAMMPS' data files and dumps, and of .xyz: the site name or element of each atom type, { 1 = "O", 2 = "H" }; X
-    has no mass. Default: labels or elements in the file, else masses"""
+    """Site name or element of each atom type in LAMMPS data files, dumps and .xyz files: { 1 = "O", 2 = "H" }; X has no
+    mass. Default: labels or elements in the file, else masses"""
 
     @model_validator(mode="after")
     def _needs_names(self):
         if self.topology is not None and not self.file.lower().endswith(NAMELESS):
-            raise ValueError(f"topology is of trajectories without names ({' '.join(NAMELESS)}), not of {self.file}")
+            raise ValueError(f"topology is for trajectories without names ({' '.join(NAMELESS)}), not for {self.file}")
         if self.topology is not None and self.topology.lower().endswith((*TRAJECTORIES, ".npz")):
             raise ValueError(f"topology = {self.topology!r}: name a structure file with names of atoms (.gro, .pdb)")
         return self
 
 
 class Box(Section):
-    """The periodic box, if any."""
+    """The periodic box."""
 
     lengths_A: Positive | tuple[Positive, Positive, Positive] | None = None
-    """Edges; one number for a cube"""
+    """Lengths of the edges; one number for a cube"""
     angles_deg: tuple[Angle, Angle, Angle] | None = None
     """Angles between b and c, c and a, a and b; default: right angles"""
     density_g_cm3: Positive | None = None
-    """Mass density, from which the edge of a cube follows"""
+    """Mass density, which sets the edge of a cube"""
     periodic: Flag = True
-    """False: no box, molecules in vacuum"""
+    """Periodic boundary conditions; false: molecules in vacuum without a box"""
 
     @model_validator(mode="after")
     def _one_size(self):
@@ -91,7 +91,7 @@ def _span_a_volume(alpha: float, beta: float, gamma: float) -> bool:
 
 
 class Start(Section):
-    """The start."""
+    """Momenta at the start."""
 
     temperature_K: NonNegative | None = None
-    """Temperature of the momenta that are drawn; that of the first stage in which time passes when not given"""
+    """Temperature at which momenta are drawn; default: the temperature of the first stage in which time passes"""

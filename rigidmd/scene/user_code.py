@@ -1,4 +1,4 @@
-"""What Python adds to a scene of molecules, which a file cannot hold: forces and a thermostat, and their names."""
+"""Forces and a thermostat that Python adds to a scene of molecules and that a scene file cannot hold."""
 
 import re
 from collections.abc import Sequence
@@ -6,19 +6,19 @@ from typing import Any, NamedTuple
 
 
 class UserCode(NamedTuple):
-    """Objects of users; `rigidmd.assemble.user_code` knows what they are."""
+    """Objects that `rigidmd.assemble.user_code` turns into terms of a system."""
 
     forces: tuple[Any, ...] = ()
     thermostat: Any = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of all, no two the same."""
+        """Unique names of all objects."""
         thermostat = () if self.thermostat is None else (f"thermostat {name_of(self.thermostat)}",)
         return (*self.force_names(), *thermostat)
 
     def force_names(self, taken: Sequence[str] = ()) -> list[str]:
-        """A name for each force: its own, with a number if that is taken."""
+        """A name for each force, with a number where it would not be unique."""
         found = list(taken)
         for force in self.forces:
             name, k = name_of(force), 1
@@ -29,7 +29,7 @@ class UserCode(NamedTuple):
 
 
 def name_of(thing: Any) -> str:
-    """The name that an object has, or that of its class as words_with_underscores."""
+    """The attribute `name` of an object, else the name of its class in snake_case."""
     named = getattr(thing, "name", None)
     if isinstance(named, str) and named:
         return re.sub(r"\W+", "_", named)
@@ -37,7 +37,7 @@ def name_of(thing: Any) -> str:
 
 
 def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
-    """The fault of a scene that lacks what Python added."""
+    """The error message of a scene without the user code that its `from_python` lists."""
     there = f"; this has {', '.join(given)}" if given else ""
     return (
         f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. Run it from Python "

@@ -1,4 +1,4 @@
-"""Input data: strict value types for pydantic, and its errors as sentences with key and line."""
+"""Validation of input tables: strict value types for pydantic, and its errors as messages with key and line."""
 
 import difflib
 import re
@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from rigidmd.core.toml import shorten_text, line_of, shorten_repr
+from rigidmd.core.toml import line_of, shorten_repr, shorten_text
 from rigidmd.errors import MOST_SHOWN
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -21,17 +21,17 @@ Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
 
-#: Tables in a list of tables. Scenes have a handful.
+#: Largest number of tables in a list of tables.
 MOST_TABLES = 1000
 
 #: With more similar names than this, no suggestion is made from a common beginning or end.
 MOST_SUGGESTIONS = 8
-#: Names longer than this, and more of them, are compared with no others: that would take long and say nothing.
+#: Limits of length and number of names beyond which none is suggested, because the comparison would take long.
 LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
 class Section(BaseModel):
-    """A frozen table of a TOML file; unknown keys are faults."""
+    """A frozen table of a TOML file; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -42,16 +42,16 @@ class Section(BaseModel):
         return self
 
     def _faults(self) -> Iterable[str]:
-        """What is wrong between the keys of this table."""
+        """Messages on keys of this table that contradict each other."""
         return ()
 
 
-#: A name or a path: without line ends and other characters that no terminal shows.
+#: A name or a path, without line ends and other control characters.
 Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
 
 
 def not_none(value: T | None) -> T:
-    """A value that may be left out of a scene, but is there where it is used: in a validated and resolved one."""
+    """The value of an optional key that validation or defaults have set."""
     assert value is not None, "the scene is not validated or not resolved"
     return value
 
@@ -59,22 +59,22 @@ def not_none(value: T | None) -> T:
 def validation_messages(
     error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
 ) -> list[str]:
-    """One sentence for each error of pydantic: line (if the TOML text is given), key, what was expected.
+    """One message for each error of pydantic: line (if the TOML text is given), key, what was expected.
 
-    overridden : dotted keys whose values come from the command line, so that they have no line
+    overridden : dotted keys whose values come from the command line and have no line
     """
     faults: dict[tuple, list[str]] = {}
     for detail in error.errors(include_url=False):
-        unknown = detail["type"] == "extra_forbidden"  # the last key is what a stranger wrote
+        unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
         names = detail["loc"][:-1] if unknown else detail["loc"]
         keys = [*(key for key in names if not _is_union_branch(key)), *(detail["loc"][-1:] if unknown else ())]
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
-            keys = keys[:-1]  # a list lacks an entry: the fault is the list's
-        # Faults beyond those that are shown only count.
+            keys = keys[:-1]  # the list lacks an entry
+        # Messages beyond the number shown are only counted.
         sentence = _sentence(detail, keys, model) if len(faults) <= MOST_SHOWN else detail["msg"]
         faults.setdefault(tuple(keys), []).append(sentence)
     # pydantic reports one error for each type that a value may have: join them. An error inside a value is more
-    # specific than one about the whole value.
+    # specific than an error of the whole value.
     around = {keys[:depth] for keys in faults for depth in range(1, len(keys))}
     return [
         f"{location_of(list(keys), text, overridden)}: {_either(list(dict.fromkeys(sentences)))}"
@@ -84,9 +84,9 @@ def validation_messages(
 
 
 def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
-    """Numbers of nested tables and lists that are too small or too large, each with its path of keys and what is wrong.
+    """Path of keys and message of numbers in nested tables and lists whose absolute value is outside these limits.
 
-    Infinities and NaN, which some keys allow, are left to the types of those keys.
+    Infinities and NaN, which some keys allow, are checked by the types of these keys.
     """
     found: list[tuple[list, str]] = []
     rest: list[tuple[list, Any]] = [([], data)]
@@ -102,13 +102,13 @@ def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[
 
 
 def _either(sentences: list[str]) -> str:
-    """Join sentences: "is 1, must be a list" and "is 1, must be a table" state only once that it is 1."""
+    """Join messages: "is 1, must be a list" and "is 1, must be a table" become "is 1, must be a list or a table"."""
     begin, must, _ = sentences[0].partition(", must be ")
     return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
 
 
 def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
-    """Where a key of a scene was given: its line, or the command line."""
+    """Where a key of a scene is set: its line and name, or "--set KEY"."""
     path = ".".join(shorten_text(str(key)) for key in keys)
     if any(f"{path}.".startswith(f"{key}.") for key in overridden):
         return f"--set {path}"
@@ -117,11 +117,11 @@ def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
 
 
 def _is_union_branch(key: Any) -> bool:
-    """Whether pydantic put this into a location to name the branch of a union."""
+    """Whether this part of a location of pydantic names the branch of a union."""
     return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
 
 
-#: Sentences on a value by the type of pydantic's error.
+#: Messages by the type of pydantic's error.
 SENTENCES = {
     "missing": "is missing",
     "too_long": "has {actual_length} entries, must not have more than {max_length}",
@@ -179,8 +179,8 @@ def suggestion(names: list[str]) -> str:
 def similar_names(name: str, known: Iterable[str]) -> list[str]:
     """Known names that an unknown one may stand for.
 
-    These are the names that differ only in case and punctuation; else those that begin with it, as when a unit is
-    forgotten, or end with it; else the one with the most similar spelling.
+    They are the names that differ only in case and punctuation; else those that begin with it, such as a key without
+    its unit, or end with it; else the one with the most similar spelling.
     """
     known = list(known)
     if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
