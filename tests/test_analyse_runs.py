@@ -133,8 +133,8 @@ def test_results_in_memory_and_from_the_folder_agree(water):
         ("density_profile", {"bins": 5}, "density spce (g/cm3)"),
         ("dielectric", {}, "Mz (D)"),
     ):
-        here = getattr(results, name)(start=0.02, **options)[column]
-        there = registry.chosen([name])[0].function(history, **options)[column]
+        here = getattr(rigidmd.analysis, name)(results, start=0.02, **options)[column]
+        there = registry.selected([name])[0].function(history, **options)[column]
         assert here == pytest.approx(there, rel=2e-3, abs=2e-3 * np.abs(there).max()), name
     seen = results._histories[0.02]
     assert np.array_equal(seen.tensor, history.tensor)
@@ -178,7 +178,7 @@ def test_g_of_r_is_that_of_mdanalysis(water):
     for a, b, block in (("OW", "OW", (1, 1)), ("OW", "HW", (1, 2)), ("HW", "HW", (2, 2))):
         selected = (u.select_atoms(f"name {name}*") for name in (a, b))
         peer = InterRDF(*selected, nbins=90, range=(0, 9.0), exclusion_block=block).run(start=first)
-        found = registry.chosen(["rdf"])[0].function(history, a, b, 9.0, 0.1)[f"g {a}-{b}"]
+        found = registry.selected(["rdf"])[0].function(history, a, b, 9.0, 0.1)[f"g {a}-{b}"]
         assert np.abs(found - peer.results.rdf).max() < 1e-3  # a pair at the edge of a bin
         assert np.abs(found - peer.results.rdf).mean() < 1e-5
 
@@ -193,7 +193,7 @@ def test_displacements_are_those_of_mdanalysis(water):
     points = MDAnalysis.Universe.empty(216, trajectory=True)
     points.load_new(history.positions.astype(np.float32), order="fac")
     peer = EinsteinMSD(points, select="all", msd_type="xyz", fft=False).run().results.timeseries
-    found = registry.chosen(["msd"])[0].function(history)["MSD spce (A^2)"]
+    found = registry.selected(["msd"])[0].function(history)["MSD spce (A^2)"]
     assert found == pytest.approx(peer[: len(found)], abs=1e-8)
 
 
@@ -229,7 +229,7 @@ def test_g_of_r_is_that_of_gromacs(water, topology):
         gmx(topology, "rdf", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-n", "run.ndx", "-o", "rdf.xvg",
             "-ref", other[a], "-sel", other[b], "-bin", "0.01", "-rmax", "0.9", "-excl", "-b", "0.0199", "-xvg", "none")  # fmt: skip
         r, g = xvg(topology / "rdf.xvg")
-        half = registry.chosen(["rdf"])[0].function(history, a, b, 9.0, 0.05)[f"g {a}-{b}"]
+        half = registry.selected(["rdf"])[0].function(history, a, b, 9.0, 0.05)[f"g {a}-{b}"]
         shells = np.diff((0.05 * np.arange(181)) ** 3)  # its bins have their middles where ours of half the width meet
         found = (half * shells)[1:-1].reshape(-1, 2).sum(axis=1) / shells[1:-1].reshape(-1, 2).sum(axis=1)
         assert r[1 : 1 + len(found)] == pytest.approx(0.01 * np.arange(1, 90))
@@ -246,7 +246,7 @@ def test_displacements_are_those_of_gromacs(water, topology):
     gmx(topology, "msd", "-f", "slow.trr", "-s", "run.tpr", "-n", "run.ndx", "-o", "msd.xvg",
         "-mol", "mol.xvg", "-trestart", "1", "-xvg", "none", "-sel", "System")  # fmt: skip
     value = xvg(topology / "msd.xvg")[1]
-    found = registry.chosen(["msd"])[0].function(history)["MSD spce (A^2)"]
+    found = registry.selected(["msd"])[0].function(history)["MSD spce (A^2)"]
     assert 100 * value[: len(found)] == pytest.approx(found, rel=1e-5)
     assert found[-1] > 0.01
 
@@ -301,7 +301,7 @@ def test_a_viscosity_without_sense_is_refused(value, water, capsys):
 
 def test_names_of_sites_are_suggested(water):
     history = of_folder(read_record(water), 0.02)
-    rdf = registry.chosen(["rdf"])[0].function
+    rdf = registry.selected(["rdf"])[0].function
     with pytest.raises(OutputError, match=r"^there is no site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce$"):
         rdf(history, "OW", "ow")
     with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
@@ -310,12 +310,12 @@ def test_names_of_sites_are_suggested(water):
         with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
             rdf(history, "OW", largest=largest, width=width)
     with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
-        registry.chosen(["density_profile"])[0].function(history, "w")
+        registry.selected(["density_profile"])[0].function(history, "w")
     with pytest.raises(OutputError, match="bins"):
-        registry.chosen(["density_profile"])[0].function(history, "z", bins=0)
+        registry.selected(["density_profile"])[0].function(history, "z", bins=0)
     for largest in (0.01, -1.0, np.nan):
         with pytest.raises(OutputError, match="no wave vector"):
-            registry.chosen(["structure_factor"])[0].function(history, largest=largest)
+            registry.selected(["structure_factor"])[0].function(history, largest=largest)
     elements, centres = rdf(history, "O", "H", width=0.5), rdf(history, "spce", width=0.5)
     assert np.array_equal(elements["g O-H"], rdf(history, "OW", "HW", width=0.5)["g OW-HW"])
     assert centres["g spce-spce"].max() > 1.4
@@ -376,7 +376,7 @@ def test_files_of_others_are_not_overwritten(copy, capsys):
     assert cli.main(["analyse", str(copy), "--only", "msd", "--from", "0.02ps"]) == 0
     (copy / "analysis.json").unlink()  # files of this command may be written anew
     assert cli.main(["analyse", str(copy), "--only", "msd,dielectric", "--from", "0.02ps"]) == 0
-    trusted = copy.parent / "assemble/user_code.py"
+    trusted = copy.parent / "own.py"
     for name, words in (
         ("log", "log.csv is there and no file"),
         ("dipole", "dipole.csv is of the analysis dielectric"),
@@ -415,8 +415,8 @@ def spins(frames):
 
 
 def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
-    (copy.parent / "assemble/user_code.py").write_text(OWN)
-    trust = ["--trust", str(copy.parent / "assemble/user_code.py"), "--from", "0.02ps"]
+    (copy.parent / "own.py").write_text(OWN)
+    trust = ["--trust", str(copy.parent / "own.py"), "--from", "0.02ps"]
     assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
     entries = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert entries["height"]["about"] == "mean height of the centres (A)"
@@ -465,11 +465,11 @@ def lambda_of(series):
 )  # fmt: skip
 def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys):
     before = names(water)
-    (tmp_path / "assemble/user_code.py").write_text(
+    (tmp_path / "own.py").write_text(
         f"import rigidmd\n@rigidmd.analysis.register\ndef mine(frames):\n    {body}\n"
     )
     assert words in said(
-        capsys, water, "--trust", tmp_path / "assemble/user_code.py", "--only", "mine", "--from", "0.02ps"
+        capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps"
     )
     assert names(water) == before
 
@@ -478,20 +478,20 @@ def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, caps
     ("text", "words"),
     [
         ("x = 1", "defines no analysis: put @rigidmd.analysis.register before a function of frames"),
-        ("raise ValueError('no')", "assemble/user_code.py raised ValueError: no"),
-        ("def (", "assemble/user_code.py raised SyntaxError"),
-        ("import sys; sys.exit(0)", "assemble/user_code.py raised SystemExit"),
-        ("import rigidmd\n@rigidmd.analysis.register\ndef rdf(frames): return frames.time", "assemble/user_code.py: rdf is an analysis that comes with"),
+        ("raise ValueError('no')", "own.py raised ValueError: no"),
+        ("def (", "own.py raised SyntaxError"),
+        ("import sys; sys.exit(0)", "own.py raised SystemExit"),
+        ("import rigidmd\n@rigidmd.analysis.register\ndef rdf(frames): return frames.time", "own.py: rdf is an analysis that comes with"),
         ("import rigidmd\nrigidmd.analysis.register(lambda frames: frames.time)", "an analysis has the name of its function"),
     ],
 )  # fmt: skip
 def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
-    (tmp_path / "assemble/user_code.py").write_text(text)
-    assert words in said(capsys, water, "--trust", tmp_path / "assemble/user_code.py")
+    (tmp_path / "own.py").write_text(text)
+    assert words in said(capsys, water, "--trust", tmp_path / "own.py")
 
 
 def test_the_names_of_analyses_are_kept_for_them():
-    registry.chosen([])
+    registry.selected([])
     assert {name for name, entry in registry.KNOWN.items() if not entry.own} == set(registry.ORDER)
 
 

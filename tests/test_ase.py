@@ -62,7 +62,7 @@ def waters(results) -> Atoms:
 
 def cluster(model: str, n: int, seed: int = 1) -> Atoms:
     """Molecules without a box, far enough from each other."""
-    return small_scene({model: n}, None, seed=seed).atoms()
+    return rigidmd.atoms_of(small_scene({model: n}, None, seed=seed))
 
 
 def same_state(first, second) -> None:
@@ -253,7 +253,7 @@ def test_atoms_that_cannot_be_used_are_told(what, said):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"models": ["spcee"]}, r"there is no model 'spcee'; did you mean spce\?"),
+        ({"models": ["spcee"]}, r"unknown model 'spcee'; did you mean spce\?"),
         ({"models": ["nowhere.toml"]}, "there is no such file"),
         ({"models": []}, "molecules: has 0 entries"),
         ({"models": [3]}, "must be a text in quotes"),
@@ -669,7 +669,7 @@ def test_acetonitrile_is_that_of_ase():
         )
     ]  # fmt: skip
     data = {"molecules": [{"name": "acn", "sites": sites, "count": 4}], "box": {"lengths_A": 12.0, "periodic": False}}
-    atoms = Scene.from_dict(data | {"stages": [{"ensemble": "minimise"}]}).atoms()
+    atoms = rigidmd.atoms_of(Scene.from_dict(data | {"stages": [{"ensemble": "minimise"}]}))
     other = atoms.copy()
     other.calc = acn.ACN(rc=1e4)
     atoms.calc = RigidMD([{"name": "acn", "sites": sites}], atom_forces="sites")
@@ -680,7 +680,7 @@ def test_acetonitrile_is_that_of_ase():
 def test_pme_in_a_slanted_cell():
     counts = {"spce": 12, "nitrogen": 4, "argon": 3}
     box = {"lengths_A": [11.0, 12.0, 13.0], "angles_deg": [80.0, 100.0, 75.0]}
-    atoms = turned(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5}).atoms())
+    atoms = turned(rigidmd.atoms_of(small_scene(counts, None, box=box, forces={"cutoff_A": 4.5})))
     keywords = {"cutoff_A": 4.5, "electrostatics": "pme", "truncation": "shift", "ewald_accuracy": 1e-6}
     atoms.calc = RigidMD(list(counts), **keywords)
     check_stress(atoms)
