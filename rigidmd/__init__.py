@@ -14,8 +14,7 @@ from rigidmd.core.display import PROVIDERS
 
 if TYPE_CHECKING:
     from rigidmd import analysis, view
-    from rigidmd.assemble.from_atoms import scene_from_atoms
-    from rigidmd.assemble.scenes import atoms_of, resolve
+    from rigidmd.assemble.scenes import atoms_of, resolve, scene_from_atoms
     from rigidmd.assemble.user_code.force import Force
     from rigidmd.assemble.user_code.pair_potential import PairLaw, pair_law
     from rigidmd.assemble.user_code.trust import trust
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BodyScene": "scene", "MolecularScene": "scene", "Scene": "scene",
     "Every": "run", "Moment": "run", "Observer": "run", "Results": "run", "Simulation": "run", "run_together": "run",
-    "resolve": "assemble.scenes", "atoms_of": "assemble.scenes", "scene_from_atoms": "assemble.from_atoms",
+    "resolve": "assemble.scenes", "atoms_of": "assemble.scenes", "scene_from_atoms": "assemble.scenes",
     "Force": "assemble.user_code.force", "trust": "assemble.user_code.trust",
     "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",

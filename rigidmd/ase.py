@@ -17,8 +17,8 @@ from ase.calculators.calculator import Calculator, all_changes
 from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
 from rigidmd.assemble.build import build
-from rigidmd.assemble.from_atoms import SOURCE, atoms_faults, scene_from_atoms
 from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, refit
+from rigidmd.assemble.scenes import SOURCE, atoms_faults, scene_from_atoms
 from rigidmd.assemble.species import species_of
 from rigidmd.core.state import State, state_of
 from rigidmd.engines.cpu import Engine
@@ -26,9 +26,9 @@ from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
 from rigidmd.io.cells import basis_of, least_skewed_cell, standard_rotation
 from rigidmd.io.structure_file import read_atoms
-from rigidmd.run.atom_forces import Form, in_ase_units
+from rigidmd.run.atom_forces import Form, ase_results
 from rigidmd.run.minimise import minimise
-from rigidmd.run.summary import minimum_figures, minimum_in_words
+from rigidmd.run.summary import describe_minimum, minimum_figures
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import Molecule
@@ -132,7 +132,7 @@ class RigidMD(Calculator):
                 stacklevel=2,
             )
         assembly, turn = placed.assembly, placed.turn
-        found = in_ase_units(assembly.system, assembly.engine, placed.state, self._form, placed.atoms)
+        found = ase_results(assembly.system, assembly.engine, placed.state, self._form, placed.atoms)
         forces = np.zeros((len(not_none(self.atoms)), 3))
         forces[assembly.order] = found["forces"] @ turn
         self.results = {"energy": found["energy"], "free_energy": found["energy"], "forces": forces}
@@ -161,7 +161,7 @@ class RigidMD(Calculator):
         stage, state = assembly.system.scene.stages[0], placed.state.copy()
         found = minimise(assembly.system, state, stage)
         if not found.converged:
-            warnings.warn(minimum_in_words(found, stage), RigidMDWarning, stacklevel=2)
+            warnings.warn(describe_minimum(found, stage), RigidMDWarning, stacklevel=2)
         self._put(atoms, placed, state)
         return minimum_figures(found, len(state.position))
 
@@ -180,7 +180,7 @@ class RigidMD(Calculator):
                 self._assembly = self._assemble(atoms, {})
             except StructureError as error:
                 hint = "They fitted before: hold the molecules rigid by constraints, or move them by RigidMD.minimise"
-                raise StructureError(SOURCE, [*error.faults, hint]) from None
+                raise StructureError(SOURCE, [*error.errors, hint]) from None
         else:
             self._assembly = self._assemble(atoms, {})
         return self._assembly.place(atoms)

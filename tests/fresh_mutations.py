@@ -160,8 +160,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F23", "Ewald sums: each of two parts may have the whole error that is asked for",
         "assemble/defaults.py",
-        "    share = accuracy / sqrt(2)  # for either part",
-        "    share = accuracy  # for either part",
+        "    part = accuracy / sqrt(2)  # of the real-space and of the reciprocal error",
+        "    part = accuracy  # of the real-space and of the reciprocal error",
         ("test_ewald.py::test_forces_are_as_accurate_as_asked_for",),
     ),
     Mutation(
@@ -181,8 +181,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F26", "LAMMPS: the pressure of the tail correction is added to that asked for",
         "engines/lammps/files.py",
-        "[(bar * BAR - beyond) / ATMOSPHERE for bar",
-        "[(bar * BAR + beyond) / ATMOSPHERE for bar",
+        "[(bar * BAR - tail_pressure) / ATMOSPHERE for bar",
+        "[(bar * BAR + tail_pressure) / ATMOSPHERE for bar",
         ("test_engine_settings.py::test_lammps_has_pressures_in_atm_less_that_of_the_tail",),
     ),
     Mutation(
@@ -268,8 +268,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F38", "torque that turns with a body: along the scene's axes, not the principal ones",
         "assemble/body_parts.py",
-        "            force, torque = _turned(force, axes.T), _turned(torque, axes.T)",
-        "            force, torque = _turned(force, axes.T), torque",
+        "            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)",
+        "            force, torque = _rotated(force, axes.T), torque",
         ("test_body_engine.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",),
     ),
     Mutation(

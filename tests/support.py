@@ -78,7 +78,7 @@ def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) ->
     engine.advance(state, scheme, dt, int(state.step[NOW]) + steps)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def spin(rotor, rotation, angular_momentum, h: float, steps: int) -> None:
     """Turn the first molecule without torque, in place."""
     for _ in range(steps):
@@ -209,7 +209,7 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
     "dynamics.model": "Model",
-    "run.pilot.trial_systems": "COMPARATORS _fitted body_trial_system molecular_trial_system",
+    "run.pilot.trial_systems": "COMPARATORS _fit_step body_trial_system molecular_trial_system",
     "run.rigid_fit": "kinds_of",
     "figures.run": "energy_figure",
     "analysis.folder": "Task analyse_folder",
@@ -281,7 +281,7 @@ HOMES = {
     "view.run_page": "write_report",
     "run.force_errors": "coulomb_errors estimated_error",
     "run.atom_forces": "_transfer_matrices",
-    "studies.accuracy.bias": "AverageRun Averages Quantity extrapolate",
+    "studies.accuracy.bias": "AverageRun AveragedQuantity Averages MeanAtStep extrapolate",
     "run.pilot.choice": "choose",
     "core.statistics": "correlation_time error_of_mean format_signed inefficiency slope",
     "engines.observables": "Reading kinetic_energies observe",
@@ -327,8 +327,7 @@ HOMES = {
     "run.report": "summary_text",
     "io.run_files": "Summary read_json",
     "io.scene_file": "write_scene",
-    "studies.sweep.folder": "Manifest Point read_manifest write_manifest",
-    "studies.sweep.names": "point_name short_keys value_name",
+    "studies.sweep.folder": "Manifest Point point_name read_manifest short_keys value_name write_manifest",
     "io.formats.traj_writer": "TrajFile",
     "io.trajectory": "from_files in_memory read_frames",
     "io.trajectory_writer": "GsdFile TrajectoryFile open_trajectory write_topology",
@@ -350,8 +349,8 @@ HOMES = {
     "run.signals": "interruptible",
     "scene.start": "Box",
     "scene.shipped": "CHAPTERS DOCS find_example notebooks",
-    "studies.accuracy.averages": "averages start_of_last_stage",
-    "studies.compare": "compare",
+    "studies.accuracy.averages": "measure_averages start_of_last_stage",
+    "studies.compare": "compare describe_run_comparison",
     "studies.export": "export",
     "studies.accuracy.accuracy": "measure_accuracy",
     "studies.stability.stability": "run_cases selected_cases",
@@ -368,13 +367,11 @@ HOMES = {
 #: Names that several modules have, or that say little alone: name here -> module:name.
 RENAMED = {
     "BATH_STEP": "core.integrators:THERMOSTAT",
-    "BiasPoint": "studies.accuracy.bias:Point",
     "SAMPLE_NUMBERS": "engines.samples:NUMBERS",
     "SHIPPED": "scene.shipped:SYSTEMS",
     "analysis_drawn": "analysis.files:drawn",
-    "averages_faults": "studies.accuracy.averages_report:faults",
+    "averages_failures": "studies.accuracy.averages_report:describe_failures",
     "axis_settings": "studies.sweep.axes:settings",
-    "differences_in_words": "studies.compare:in_words",
     "gromacs_unsupported": "engines.gromacs.files:unsupported_features",
     "lennard_jones_energy_and_force": "forces.potentials.lennard_jones:energy_and_force",
     "lennard_jones_tail": "forces.potentials.lennard_jones:tail",

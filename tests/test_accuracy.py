@@ -15,23 +15,23 @@ from support import (
     SCHEMES,
     SPRING,
     IntegratorAccuracy,
+    MeanAtStep,
     Method,
     Trial,
-    averages,
     averages_report,
     body_trial_system,
     choosing,
     extrapolate,
     measure,
-    measuring,
     measure_accuracy,
+    measure_averages,
+    measuring,
     sampling,
     small_scene,
     springs,
     time_span,
     write_accuracy,
 )
-from support import BiasPoint as Point
 from support import accuracy_recommendations as recommendations
 from support import accuracy_row as row
 from support import accuracy_table as table_text
@@ -148,14 +148,16 @@ def test_a_step_that_is_good_for_the_span_only_is_timed_on_the_span(clockwork):
 
 def test_timings_alternate_between_trials(monkeypatch):
     order = []
-    monkeypatch.setattr(measuring, "time_span", lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order))
+    monkeypatch.setattr(
+        measuring, "time_span", lambda trial_system, trial: order.append(trial.steps) or 1e-3 * len(order)
+    )
     trial_system, _ = body_trial_system(Scene.read(TOP), 0.01)
     trials = [Trial("velocity_verlet", 0.01 / n, n, n) for n in (2, 3, 4)]
-    shares = []
-    measure(trial_system, trials, 2, say=shares.append)
+    fractions = []
+    measure(trial_system, trials, 2, progress=fractions.append)
     assert order == [2, 3, 4, 2, 3, 4]
     assert [trial.seconds for trial in trials] == [[1e-3, 4e-3], [2e-3, 5e-3], [3e-3, 6e-3]]
-    assert shares == pytest.approx(np.arange(1, 7) / 6)
+    assert fractions == pytest.approx(np.arange(1, 7) / 6)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning:matplotlib")  # an axis on which all points have one value
@@ -165,7 +167,7 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
     def told(*seconds):
         trials = [Trial("velocity_verlet", 1e-3, 100, 100, list(s), *[1e-6] * 6) for s in seconds]
         found = IntegratorAccuracy(trial_system, trials, 1000, 1e-14)
-        return found, "\n".join(advice(found))
+        return found, "\n".join(recommendations(found))
 
     found, words = told((1.0, 1.1, 1.19), (1.0, 1.0, 1.0))
     assert [row(found, trial)[4] for trial in found.trials] == pytest.approx([100 * 0.19 / 1.1, 0])
@@ -193,7 +195,7 @@ def test_the_front_and_the_advice_follow_from_the_numbers(top):
     assert min(own[0].time, own[1].time) <= at.seconds <= max(own[0].time, own[1].time)
     assert top.time_for("velocity_verlet", "energy_rms", 1e-30) is None
     timed = [dataclasses.replace(trial, seconds=[float(trial.forces)] * 3) for trial in top.trials]
-    said = "\n".join(advice(dataclasses.replace(top, trials=timed)))
+    said = "\n".join(recommendations(dataclasses.replace(top, trials=timed)))
     assert re.search("for an error of Q of (1e-0[024] to )?1e-0[46] over 0.4 s the cheapest is srkn_", said)
     assert "times faster than velocity_verlet" in said
     assert "within the spread" not in said
@@ -220,7 +222,7 @@ def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a
         ("velocity_verlet", 1e-3, (2.0, 2.0, 2.0), 2e-9), ("srkn_4", 5e-3, (1.0, 1.0, 1.0), 5e-7),
         ("srkn_4", 2.5e-3, (1.9, 1.9, 1.9), 5e-9), ("pefrl", 2e-3, (9.0, 9.0, 9.0), 1e-1),
     )  # fmt: skip
-    said, most = advice(found), "times the largest kinetic energy over 0.1 s the cheapest is srkn_4 at"
+    said, most = recommendations(found), "times the largest kinetic energy over 0.1 s the cheapest is srkn_4 at"
     assert said[0] == (
         f"for an energy error of 1e-02 to 1e-06 {most} 0.005 s (its longest step tried): 2.0 times faster than "
         "velocity_verlet at 0.001 s"
@@ -246,7 +248,7 @@ def test_no_step_at_the_edge_of_stability_is_recommended(next_step, step, limit)
 def test_no_advantage_is_claimed_within_the_spread_of_the_timings(slow, fast):
     found = made(("velocity_verlet", 1e-3, slow, 1e-5), ("srkn_4", 5e-3, (0.99, 1.0, 1.01), 1e-5),
                  ("pefrl", 2e-3, (1.0, 1.0, 1.0), 1e-1))  # fmt: skip
-    (line,) = (line for line in advice(found) if line.startswith("for an energy error"))
+    (line,) = (line for line in recommendations(found) if line.startswith("for an energy error"))
     assert ("1.2 times faster than velocity_verlet" in line) == fast
     assert ("as fast within the spread of the timings: velocity_verlet at 0.001 s" in line) != fast
 
@@ -276,7 +278,7 @@ def test_a_step_that_is_too_long_diverges_and_is_stopped():
     assert bad.diverged
     assert bad.seconds == []
     assert found.stable_step("velocity_verlet") == pytest.approx(1.0)
-    assert "velocity_verlet diverges beyond 1 fs" in "\n".join(advice(found))
+    assert "velocity_verlet diverges beyond 1 fs" in "\n".join(recommendations(found))
     assert "fails" in table_text(found)
 
 
@@ -284,7 +286,7 @@ def test_molecules_start_where_the_last_stage_does():
     stages = [{"ensemble": "nvt", "temperature_K": 200.0, "duration_ps": 0.2}, {"duration_ps": 1.0}]
     scene = small_scene({"nitrogen": 8}, 18.5, stages=stages)
     found = measure_accuracy(scene, ["velocity_verlet", "srkn_6"], [8.0, 4.0], repeats=1)
-    assert "kT per degree of freedom, at the" in "\n".join(advice(found))
+    assert "kT per degree of freedom, at the" in "\n".join(recommendations(found))
     verlet = trials(found, "velocity_verlet")
     assert verlet[0].energy_rms / verlet[1].energy_rms == pytest.approx(4, rel=0.5)
     assert all(trial.position_error < 1 for trial in found.trials)
@@ -295,8 +297,11 @@ def test_mixed_precision_says_what_its_forces_lose():
     found = measure_accuracy(scene, ["velocity_verlet"], [2.0], span=0.01, repeats=1)
     force, torque = found.trial_system.rounding
     assert 1e-8 < force < 1e-5 and 1e-8 < torque < 1e-5
-    assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(advice(found))
-    assert measure_accuracy(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).trial_system.rounding is None
+    assert f"forces differ from double ones by {force:.1e} of their rms" in "\n".join(recommendations(found))
+    assert (
+        measure_accuracy(small_scene({"argon": 8}, 18.5), ["velocity_verlet"], [2.0], repeats=1).trial_system.rounding
+        is None
+    )
 
 
 def test_only_what_keeps_its_order_is_tried():
@@ -305,7 +310,7 @@ def test_only_what_keeps_its_order_is_tried():
     names = {trial.integrator for trial in found.trials}
     assert "suzuki_4" in names
     assert "srkn_6" not in names
-    said = "\n".join(advice(found))
+    said = "\n".join(recommendations(found))
     assert "srkn_6: the free motion of a body with wheels has no exact flow: it would be of order 2\n" in said
     with pytest.raises(SceneError, match=r"srkn_6 does not suit this scene: .* wheels .*: it would be of order 2$"):
         measure_accuracy(wheel, ["srkn_6"])
@@ -391,7 +396,7 @@ def test_averages_show_what_a_step_takes_from_temperatures(water, tmp_path):
     said = table_text(found)
     assert "T_rot - T_trans (K): on the steps" in said
     assert "(reference)" in said
-    assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(advice(found))
+    assert "velocity_verlet at 4 fs: T_rot - T_trans is" in "\n".join(recommendations(found))
     written = write_accuracy(tmp_path, found, "a command")
     rows = list(csv.DictReader((tmp_path / "accuracy_averages.csv").read_text().splitlines()))
     assert [path.name for path in written][-1] == "accuracy_averages.csv"
@@ -404,7 +409,7 @@ def test_comparators_stand_beside_the_schemes_and_fail_in_words():
     names = ["velocity_verlet", "rk4", "rk4_quaternion", "rk4_euler_angles", "dop853"]
     found = measure_accuracy(Scene.from_dict(upright), names, [1e-3, 5e-4], span=0.2, repeats=1)
     assert {trial.integrator for trial in found.trials if trial.diverged} == {"rk4_euler_angles"}
-    assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(advice(found))
+    assert "rk4_euler_angles: the Euler angles became singular" in "\n".join(recommendations(found))
     drift = {trial.integrator: trial.orthogonality_error for trial in found.trials if not trial.diverged}
     assert drift["velocity_verlet"] < 1e-13
     assert drift["rk4"] > 1e-11  # nothing keeps Q a rotation there
@@ -427,14 +432,18 @@ def test_the_formulation_of_the_scene_is_the_one_measured():
         errors[name.removeprefix("rk4_")] = trial.rotation_error
     assert len(set(errors.values())) == 3
     for form in FORMULATIONS:
-        (trial,) = measure_accuracy(changed(integrator="rk4", formulation=form), ["rk4"], [1e-3], span=0.2, repeats=1).trials
+        (trial,) = measure_accuracy(
+            changed(integrator="rk4", formulation=form), ["rk4"], [1e-3], span=0.2, repeats=1
+        ).trials
         assert trial.rotation_error == errors[form]
 
 
 @pytest.fixture
 def planned(monkeypatch):
     """(names tried, what was left out) by default on a scene; nothing is run."""
-    monkeypatch.setattr(choosing, "measure", lambda trial_system, trials, *_: IntegratorAccuracy(trial_system, trials, 1, 0.0))
+    monkeypatch.setattr(
+        choosing, "measure", lambda trial_system, trials, *_: IntegratorAccuracy(trial_system, trials, 1, 0.0)
+    )
 
     def plan(scene):
         found = measure_accuracy(scene)
@@ -462,9 +471,9 @@ def test_what_cannot_be_measured_is_left_out_in_words(planned):
     assert "rk4_quaternion" in names
     names, left_out = planned(Scene.read(ROOT / "systems" / "dropped_stone.toml"))
     assert "rk4" in names
-    assert "a point does not turn" in left_out["rk4_quaternion"]
+    assert "a point does not rotate" in left_out["rk4_quaternion"]
     _, left_out = planned(Scene.read(ROOT / "systems" / "gyroscope_friction.toml"))
-    assert left_out["rk4"] == "dry friction jumps where a body stops, which it cannot step over"
+    assert left_out["rk4"] == "dry friction is discontinuous where a body stops, which it cannot resolve"
     with pytest.raises(SceneError, match="rk4_quaternion does not suit this scene: it is for single bodies"):
         measure_accuracy(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["rk4_quaternion"])
 
@@ -489,21 +498,21 @@ def test_what_else_is_kept_is_shown(top):
 
 def test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out():
     slopes, error = {"a": 0.3, "b": -0.1}, 0.01
-    points = [Point(name, dt, 5 + b * dt**2, error) for name, b in slopes.items() for dt in (1.0, 2.0, 3.0)]
+    points = [MeanAtStep(name, dt, 5 + b * dt**2, error) for name, b in slopes.items() for dt in (1.0, 2.0, 3.0)]
     fit = extrapolate(points)
     assert fit.limit == pytest.approx(5)
     assert fit.longest == 3
     assert {name: at[0] for name, at in fit.slopes.items()} == pytest.approx(slopes)
-    wild = Point("a", 6.0, 5 + 0.3 * 36 + 0.02 * 6**4, error)
+    wild = MeanAtStep("a", 6.0, 5 + 0.3 * 36 + 0.02 * 6**4, error)
     assert extrapolate([*points, wild]) == fit
     assert fit.bias(wild)[0] == pytest.approx(0.3 * 36 + 0.02 * 6**4)
     assert fit.bias(wild)[1] == pytest.approx(np.hypot(error, fit.limit_error))
     known = extrapolate(points, exact=4.9)
     assert (known.limit, known.limit_error) == (4.9, 0.0)
     assert known.bias(points[0]) == pytest.approx((points[0].mean - 4.9, error))
-    alone = extrapolate([Point("a", 2.0, 7.0, 0.1), Point("b", 4.0, 8.0, 0.1)])
+    alone = extrapolate([MeanAtStep("a", 2.0, 7.0, 0.1), MeanAtStep("b", 4.0, 8.0, 0.1)])
     assert (alone.limit, alone.limit_error, alone.slopes) == (7.0, 0.1, {})
-    assert alone.bias(Point("a", 2.0, 7.0, 0.1)) == (0.0, 0.0)
+    assert alone.bias(MeanAtStep("a", 2.0, 7.0, 0.1)) == (0.0, 0.0)
 
 
 def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
@@ -513,7 +522,7 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
     for _ in range(2000):
         noise = errors * rng.standard_normal((2, 4))
         points = [
-            Point(name, *point)
+            MeanAtStep(name, *point)
             for name, b, n in zip("ab", (0.02, 0.05), noise, strict=True)
             for point in zip(steps, 2 + b * steps**2 + n, errors, strict=True)
         ]
@@ -532,12 +541,12 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
 def oscillators():
     """Springs at w dt = 1 and less, by velocity Verlet and BAOAB."""
     unit = 1e3 * np.sqrt(39.948 / SPRING)  # fs of a radian
-    shares = []
-    found = averages(
-        springs(), ["velocity_verlet", "baoab"], [0.4 * unit, 0.7 * unit, unit], sample=60.0, say=shares.append
+    fractions = []
+    found = measure_averages(
+        springs(), ["velocity_verlet", "baoab"], [0.4 * unit, 0.7 * unit, unit], sample=60.0, progress=fractions.append
     )
-    assert shares == sorted(shares)
-    assert shares[-1] == pytest.approx(1)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == pytest.approx(1)
     return found
 
 
@@ -575,21 +584,21 @@ def test_what_is_said_of_averages_follows_from_them(oscillators):
     assert coarse.method == "velocity_verlet + langevin"
     assert abs(bias - (1 / 0.75 - 1) / 2) < 4 * error < 0.1
     # 1 % of kT is x/8
-    step, seen = oscillators.off_at("velocity_verlet + langevin", potential)
+    step, seen = oscillators.step_at_limit("velocity_verlet + langevin", potential)
     assert seen
     assert step == pytest.approx(1e3 * np.sqrt(0.08 * 39.948 / SPRING), rel=0.1)
-    assert not oscillators.off_at("velocity_verlet + langevin", quantities["T_trans"])[1]
-    said = "\n".join(averages_report.advice(oscillators))
+    assert not oscillators.step_at_limit("velocity_verlet + langevin", quantities["T_trans"])[1]
+    said = "\n".join(averages_report.bias_conclusions(oscillators))
     assert f"U is off by 1% of kT per degree of freedom at: velocity_verlet + langevin {step:.2g} fs; baoab" in said
     assert "T_trans is off by 1% of its value at: velocity_verlet + langevin none seen, more than" in said
-    assert "temperatures are held against 300 K" in said
+    assert "temperatures are compared with 300 K" in said
     assert coarse.forces_per_ps == pytest.approx(1e3 / coarse.timestep)
     assert coarse.seconds_per_ns > 0
 
 
 def test_averages_leave_out_what_comes_before_equilibrium():
     """A fifth of the time sampled comes before it: the means are those of the same run without its first part."""
-    (run,) = averages(springs(), ["baoab"], [10.0], sample=2.0).runs
+    (run,) = measure_averages(springs(), ["baoab"], [10.0], sample=2.0).runs
     again = springs(integrator="baoab", timestep_fs=10.0, duration_ps=2.4)
     looked = again.output.model_copy(update={"log_interval_ps": 0.02})
     results = Simulation(again.model_copy(update={"output": looked})).run()
@@ -617,7 +626,7 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
     assert rows[2]["density (g/cm³)"] == ""
     told = json.loads((folder / "accuracy.json").read_text())
     assert told["runs"][0]["averages"]["density"]["mean"] == float(rows[0]["density (g/cm³)"])
-    assert told["runs"][2]["fault"].startswith("stopped at step")
+    assert told["runs"][2]["failure"].startswith("stopped at step")
     assert "pressure" not in told["quantities"]
     assert (folder / "averages.png").read_bytes().startswith(b"\x89PNG")
     page = (folder / "averages.html").read_text("utf-8")
@@ -637,20 +646,20 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
     assert main(["accuracy", water, "--sample-ps", "3"]) == 2
     assert "it goes with --averages" in capsys.readouterr().err
     with pytest.raises(SceneError, match="a single body has no thermostat"):
-        averages(Scene.read(TOP))
+        measure_averages(Scene.read(TOP))
     with pytest.raises(SceneError, match="one temperature and one pressure"):
-        averages(springs(temperature_K=[300.0, 200.0]))
+        measure_averages(springs(temperature_K=[300.0, 200.0]))
     with pytest.raises(SceneError, match=r"no thermostat langevn; did you mean|no thermostat langevn"):
-        averages(springs(), ["baoab+langevn"])
+        measure_averages(springs(), ["baoab+langevn"])
     with pytest.raises(SceneError, match="there is no verlet"):
-        averages(springs(), ["verlet"])
+        measure_averages(springs(), ["verlet"])
     with pytest.raises(SceneError, match="greater than 0"):
-        averages(springs(), sample=0.0)
+        measure_averages(springs(), sample=0.0)
 
 
 def test_methods_and_steps_that_are_averaged_by_default(monkeypatch):
     monkeypatch.setattr(sampling, "_sample", lambda *_: None)
-    found = averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
+    found = measure_averages(springs(thermostat="nose_hoover", friction_translation_per_ps=None))
     assert list(dict.fromkeys((run.integrator, run.thermostat) for run in found.runs)) == [
         ("velocity_verlet", "nose_hoover"), ("baoab", "langevin"), ("velocity_verlet", "velocity_rescaling")
     ]  # fmt: skip

@@ -700,9 +700,9 @@ def test_takahashi_imada_is_of_order_four_but_for_a_change_of_variables():
 
 def test_a_gradient_is_not_asked_of_forces_that_have_none():
     for more in ({"friction": {"viscous_N_m_s": [0.1, 0.1, 0.1]}}, {"applied": [{"force_N": [1.0, 0, 0]}]}):
-        with pytest.raises(SceneError, match="chin_4a asks for the gradient of the forces"):
+        with pytest.raises(SceneError, match="chin_4a needs the gradient of the forces"):
             simulate(FREE | more, run__integrator="chin_4a")
-    with pytest.raises(SceneError, match="chin_4a asks for the gradient"):
+    with pytest.raises(SceneError, match="chin_4a needs the gradient"):
         simulate(FREE, applied={"push": lambda pose: ([0, 0, 0], [0, 0, 0])}, run__integrator="chin_4a")
 
 

@@ -200,7 +200,9 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
         if barostat == "monte_carlo":
             return VolumeMoves(constant_ramp(THERMAL), asked, 600.0, float(n), (0.0, 0.0), key)
         at_rest = (1.0,) * 3 if thermostat == "velocity_rescaling" else (0.0,) * 3
-        return CellRescaling(constant_ramp(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key)
+        return CellRescaling(
+            constant_ramp(THERMAL), asked, 10.0 / pressure, COUPLINGS["isotropic"], at_rest, (0.0, 0.0), key
+        )
 
     volumes, moves = gas(n, thermostat, box_for)
     assert 0.2 < moves[1] / moves[0] < 0.99  # what is rejected matters
@@ -329,7 +331,7 @@ def test_a_barostat_does_not_go_with_a_field_on_net_charges(coupled):
            "position_A": [0.0, 0.0, 0.0]}  # fmt: skip
     scene = small_scene({"argon": 5}, 30.0, stages=[coupled], fields={"electric_V_per_nm": [0.0, 0.0, 0.1]},
                         molecules=[{"name": "ion", "sites": [ion], "count": 8}])  # fmt: skip
-    with pytest.raises(SceneError, match="electric field depend on places"):
+    with pytest.raises(SceneError, match="electric field depend on absolute positions"):
         build(scene)
 
 

@@ -148,7 +148,7 @@ def test_a_table_serves_where_it_is_accurate_enough():
         assert screening_of_lanes(alpha, cutoff, np.float64) == screening(alpha, cutoff)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def screened_pairs(law, r2, energy, force):
     for i in range(0, len(r2), lanes.width_of(r2)):
         at = lanes.load(r2, i)
@@ -613,7 +613,9 @@ def test_waves_without_compiled_code():
     system, engine, state = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
     engine.evaluate(state)
     term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums
-    energy, force, virial = ewald_sum_in_numpy(term.charge, own.position, cell_of(system.space), term.alpha, term.k_vectors)
+    energy, force, virial = ewald_sum_in_numpy(
+        term.charge, own.position, cell_of(system.space), term.alpha, term.k_vectors
+    )
     assert energy == pytest.approx(own.tallies[:, 0].sum(), rel=1e-11)
     assert force == pytest.approx(own.force, abs=1e-11 * np.abs(force).max())
     assert virial.ravel() == pytest.approx(own.tallies[:, 1:].sum(axis=0), rel=1e-9, abs=1e-9 * abs(energy))
@@ -632,7 +634,9 @@ def test_waves_of_a_slanted_cell():
         own = engine.workspaces["waves"]
         position = (own.sums if method is TIGHT_EWALD else own.mesh).position
         found[method["electrostatics"]] = (tallies["waves"].energy, own.site_force.copy(), tallies["waves"].virial)
-        energy, force, _ = ewald_sum_in_numpy(term.charge, position, cell_of(slanted), 0.9, k_vectors_up_to((20, 20, 20)))
+        energy, force, _ = ewald_sum_in_numpy(
+            term.charge, position, cell_of(slanted), 0.9, k_vectors_up_to((20, 20, 20))
+        )
         error = 1e-11 if method is TIGHT_EWALD else 3e-6
         assert tallies["waves"].energy == pytest.approx(energy, rel=error)
         assert own.site_force == pytest.approx(force, abs=10 * error * np.abs(force).max())
@@ -825,7 +829,7 @@ def test_what_energy_says_of_its_figures():
         own = -law.alpha / np.sqrt(np.pi) * (system.of_sites(lambda m: m.charges) ** 2).sum()
         own -= 0.5 * erfc(law.alpha * 6.0) / 6.0 * net
         assert found["components"]["coulomb_self"] * KJ_PER_MOL == pytest.approx(KE * own, rel=1e-9)
-        assert "less its value at the cut-off" in said["coulomb_real"]
+        assert "less its value at the cutoff" in said["coulomb_real"]
         assert "without the tail correction" in said["virial"]
         translation = observe(system, simulation.engine, simulation.state).kinetic_translation / KJ_PER_MOL
         bar = (2 * translation + found["virial"]) * KJ_PER_MOL / (3 * 13 * 14 * 15) / BAR
@@ -988,8 +992,8 @@ def test_liquid_spce_is_the_published_one():
         ({"electrostatics": "pme", "ewald_truncation": "switch"}, "ewald_truncation: is 'switch', must be 'plain' or 'shift'"),
         ({"electrostatics": "ewald", "ewald_k2_max": 9}, "ewald_k2_max needs ewald_k_max"),
         ({"electrostatics": "ewald", "ewald_k_max": 9, "ewald_k2_max": 9, "ewald_k_radius_per_A": 1.0}, "not both"),
-        ({"electrostatics": "ewald", "ewald_k_radius_per_A": 1e3}, "more than 1000 waves along an edge"),
-        ({"electrostatics": "ewald", "ewald_k_radius_per_A": 1e-3}, "leaves no wave at all"),
+        ({"electrostatics": "ewald", "ewald_k_radius_per_A": 1e3}, "more than 1000 k-vectors along an edge"),
+        ({"electrostatics": "ewald", "ewald_k_radius_per_A": 1e-3}, "leaves no k-vector"),
         ({"electrostatics": "ewald", "ewald_k_max": 9, "ewald_alpha_per_A": 0.3, "ewald_accuracy": 1e-4},
          "ewald_accuracy would do nothing: alpha"),
         ({"electrostatics": "pme", "pme_order": 9}, "pme_order: is 9, must not be more than 8"),
@@ -997,7 +1001,7 @@ def test_liquid_spce_is_the_published_one():
         ({"electrostatics": "ewald", "ewald_alpha_per_A": 2.0}, "far below rounding; at most 1.33 is of use"),
         ({"electrostatics": "damped_shifted_force", "damping_per_A": 2.0}, "at most 1.33 is of use"),
         ({"electrostatics": "pme", "pme_grid": [8, 8, 8], "pme_order": 4, "ewald_accuracy": 1e-6}, None),
-        ({"electrostatics": "pme", "pme_grid": [8, 8, 8], "ewald_accuracy": 1e-6}, "cannot be had with the forces.pme_order or"),
+        ({"electrostatics": "pme", "pme_grid": [8, 8, 8], "ewald_accuracy": 1e-6}, "cannot be reached with the given forces.pme_order or"),
     ],
 )  # fmt: skip
 def test_settings_that_make_no_sense(forces, words):
@@ -1013,7 +1017,7 @@ def test_settings_that_make_no_sense(forces, words):
 @pytest.mark.parametrize(("method", "words"), [
     ("ewald", "sums over the images of a periodic box, and there is none"),
     ("pme", "sums over the images of a periodic box, and there is none"),
-    ("damped_shifted_force", "ends at a cut-off; give forces.cutoff_A"),
+    ("damped_shifted_force", "needs a cutoff; give forces.cutoff_A"),
 ])  # fmt: skip
 def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
     with pytest.raises(SceneError, match=words):

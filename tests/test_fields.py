@@ -468,7 +468,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         ({"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]}, NO_BOX, "the walls across z leave no space between them"),
         ({"walls": [LJ | {"positions_A": [0.0, 22.0]}]}, {},
          "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may stand out, "
-         "and the cut-off of 9 Å"),
+         "and the cutoff of 9 Å"),
         ({"walls": [LJ]}, {"box": {"lengths_A": 40.0, "angles_deg": [90.0, 80.0, 90.0]}}, "need a box with right angles"),
         ({"walls": [LJ | {"positions_A": [0.0, 5.0]}]}, {}, "those across z leave no room for molecules to start"),
         ({"walls": [LJ]}, {"molecules": [{"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}]},
@@ -516,7 +516,10 @@ def test_fields_that_are_tied_to_places_say_so():
     assert not scene(OSCILLATING).fields.depends_on_position
     assert build(scene(OSCILLATING)).position_dependent == []
     assert alone({"kite": 1, "etik": 1}, STEADY)[0].position_dependent == ["electric_field"]
-    assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).position_dependent == ["walls_0", "restraints_0"]
+    assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).position_dependent == [
+        "walls_0",
+        "restraints_0",
+    ]
     assert not build(scene({"electric_V_per_nm": [0.0, 0.0, 0.0]})).external  # a sweep may pass through nothing
 
 

@@ -511,7 +511,7 @@ def test_another_mixing_rule_than_the_model_was_made_with_is_said(own, capsys):
     assert main(["check", str(own / "own.toml")]) == 0
     assert "mixing" not in capsys.readouterr().out
     assert main(["check", str(own / "own.toml"), "--set", "forces.mixing=lorentz-berthelot"]) == 0
-    said = "benzene_opls was made with geometric mixing, forces.mixing is lorentz-berthelot"
+    said = "benzene_opls was developed with geometric mixing, forces.mixing is lorentz-berthelot"
     assert said in capsys.readouterr().out
 
 
@@ -627,7 +627,7 @@ def test_the_schema_knows_the_new_keys(capsys):
 
 
 def test_a_model_that_is_not_there():
-    with pytest.raises(MoleculeError, match="there is no model 'ice'"):
+    with pytest.raises(MoleculeError, match="unknown model 'ice'"):
         load_model("ice")
 
 

@@ -67,7 +67,7 @@ def points(**sections) -> rigidmd.MolecularScene:
 # --- functions of vectors --------------------------------------------------------------------------------------------
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def every_function(x, y, out):
     for i in range(0, len(x), lanes.width_of(x)):
         a, b = lanes.load(x, i), lanes.load(y, i)
@@ -396,7 +396,9 @@ def test_who_interacts_with_which_parameters():
     parameters, interacts = numbers(rigidmd.pair_law("k/r**9", {"AR": {"k": 1.0}, "argon.AR": {"k": 2.0}}))
     assert parameters[0] == pytest.approx(200)
     assert interacts.shape == (1, 1)
-    one = build(small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms["pair_law"]
+    one = build(small_scene({"argon": 3}, 25.0).with_user_code([rigidmd.pair_law("k/r**9", {"k": 2.0})])).terms[
+        "pair_law"
+    ]
     assert one.potential.interacts.shape == (1, 1)
     with pytest.raises(SceneError, match=r"have no geometric mean"):
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
@@ -414,7 +416,7 @@ def test_who_interacts_with_which_parameters():
         numbers(rigidmd.pair_law("k/r**9", both, truncation="shift", switch_start_A=7.0))
     with pytest.raises(SceneError, match=r"longer than half"):
         numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=13.0))
-    with pytest.raises(SceneError, match="it has no cut-off, and the box is periodic"):
+    with pytest.raises(SceneError, match="it has no cutoff, and the box is periodic"):
         numbers(rigidmd.pair_law("k/r**9", {"k": 1.0}, cutoff_A=math.inf))
 
 
@@ -427,7 +429,7 @@ def test_parameters_may_come_from_the_model():
         forces={"custom": [{"name": "wall", "energy": "k/r**9"}]},
     )
     assert build(scene).terms["wall"].potential.parameters[0, 0, 0] == pytest.approx(300)
-    assert "wall: k/r**9, 10 sites, cut-off 9 Å, switch" in describe(scene)
+    assert "wall: k/r**9, 10 sites, cutoff 9 Å, switch" in describe(scene)
 
 
 @pytest.mark.parametrize(
@@ -620,7 +622,7 @@ def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers
 
 def test_forces_from_python_exclude_what_they_cannot_go_with():
     stage = {"ensemble": "npt", "temperature_K": 94, "pressure_bar": 1, "duration_ps": 1}
-    with pytest.raises(SceneError, match="spring depend on places in it: keep the volume"):
+    with pytest.raises(SceneError, match="spring depend on absolute positions in it: keep the volume"):
         rigidmd.Simulation(points(stages=[stage]), forces=[Spring()])
     top = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml")
     with pytest.raises(SceneError, match="forces: for molecules; a single body takes applied"):
@@ -710,7 +712,7 @@ def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):
         ({"name": "x"}, "give a module"),
         ({"name": "x", "module": "m.py", "energy": "1/r"}, "give a module"),
         ({"name": "x", "module": "m.py", "sites": ["A"]}, "sites would do nothing with a module"),
-        ({"name": "x", "module": "m.txt"}, "ending in .py"),
+        ({"name": "x", "module": "m.txt"}, "must be a Python file"),
         ({"name": "x", "module": "../m.py"}, "outside the scene's folder"),
         ({"name": "x y", "energy": "1/r"}, "name"),
     ],
@@ -730,11 +732,11 @@ def test_code_for_classes_of_users_has_an_index_of_its_own():
     def key(value):
         return ((numba.typeof((value, 1.0)),), ())
 
-    assert index._apart(key(1.0)) is index
-    assert index._apart(key(Pair(1.0, 2.0))) is None  # of a module that may change: not kept
+    assert index._index_for(key(1.0)) is index
+    assert index._index_for(key(Pair(1.0, 2.0))) is None  # of a module that may change: not kept
     of_file = own_code.module_of(source, "<test>", own_code.OF_FILE).Term
-    assert index._apart(key(of_file(1.0))) is None  # it may hold what it has read
-    apart = index._apart(key(kept(1.0)))
+    assert index._index_for(key(of_file(1.0))) is None  # it may hold what it has read
+    apart = index._index_for(key(kept(1.0)))
     assert apart._index_path not in (index._index_path, None)
 
 

@@ -280,7 +280,7 @@ def test_one_point_molecule_runs_under_every_thermostat(thermostat):
     moves = thermostat in ("langevin", "andersen")
     assert results.summary["degrees_of_freedom"] == (3 if moves else 0)
     assert f"{3 if moves else 0} degrees of freedom" in run.introduction()
-    assert any("there is no temperature" in note for note in results.summary["notes"]) != moves
+    assert any("no temperature is defined" in note for note in results.summary["notes"]) != moves
     told = results.summary["stages"][0]["temperature_K"]
     assert told > 0 if moves else told is None
     if moves:
@@ -406,7 +406,9 @@ def test_two_engines_agree_by_the_size_of_each_quantity(density, gap, agrees):
     box, forces = {"density_g_cm3": density}, {"cutoff_A": 4.6, "truncation": "plain"}
     system = build(small_scene({"argon": 32}, None, box=box, forces=forces, start={"temperature_K": 1.0}))
     term = system.terms["lennard_jones"]
-    other = term._replace(potential=term.potential._replace(c12=term.potential.c12 * (1 + gap), c6=term.potential.c6 * (1 - gap)))
+    other = term._replace(
+        potential=term.potential._replace(c12=term.potential.c12 * (1 + gap), c6=term.potential.c6 * (1 - gap))
+    )
     here, there = (system.engine_of({"lennard_jones": each}, "double") for each in (term, other))
     state = shaken(system, 1, 0.05)[2]
     lines = compare_at(system, state, here, there)
@@ -651,7 +653,7 @@ def test_faults_of_all_tables_are_said_at_once():
 
 def test_an_accuracy_that_cannot_be_had_is_called_the_default():
     forces = {"electrostatics": "pme", "cutoff_A": 6.0, "ewald_alpha_per_A": 1.3}
-    with pytest.raises(SceneError, match=r"ewald_accuracy = 1e-05 \(the default\) cannot be had"):
+    with pytest.raises(SceneError, match=r"ewald_accuracy = 1e-05 \(the default\) cannot be reached"):
         build(small_scene({"spce": 30}, 18.5, forces=forces | {"pme_grid": [8, 8, 8]}))
 
 
@@ -1185,7 +1187,9 @@ def test_a_look_at_another_state_is_an_evaluation():
     other.position[:] += 0.1 * np.arange(20)[:, None]
     engine.advance(other, row, 1e-3, 0, observed=True)  # no step
     expected = system.engine().evaluate(other)[1]
-    assert engine.evaluate_current(other)[1]["lennard_jones"].energy == pytest.approx(expected["lennard_jones"].energy, rel=1e-12)
+    assert engine.evaluate_current(other)[1]["lennard_jones"].energy == pytest.approx(
+        expected["lennard_jones"].energy, rel=1e-12
+    )
 
 
 def test_two_intervals_of_the_log_end_in_the_same_bits(tmp_path):

@@ -67,7 +67,7 @@ def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
         ("count = 20", "count = 20\n'a' = True", "line 7: molecules.0.a: is True, must be written true"),
         ("count = 20", "count = 20\n() = True", "is not TOML"),
         ("[[stages]]", own_molecule(more=", sigma_A = 9e25, epsilon_K = 1.0"), "sigma_A of 9e+25 Å with epsilon overflows"),
-        ("[start]", '[forces]\nelectrostatics = "ewald"\newald_k_max = 1000\n[start]', "8e+09 waves, more than 2e+07"),
+        ("[start]", '[forces]\nelectrostatics = "ewald"\newald_k_max = 1000\n[start]', "8e+09 k-vectors, more than 2e+07"),
         ("20.0", '[20.0, 20.0, 1e6]\n[forces]\nelectrostatics = "pme"', "an edge of 1e+06 Å is too long for a grid"),
     ],
 )  # fmt: skip

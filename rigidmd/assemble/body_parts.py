@@ -21,7 +21,7 @@ from rigidmd.mechanics.time_functions import (
     sum_functions,
 )
 from rigidmd.scene import BodyScene
-from rigidmd.scene.body_forces import Timed
+from rigidmd.scene.body_forces import Fluid, Friction, Timed
 from rigidmd.scene.validation import not_none
 
 #: Principal moments of a tensor are equal if they differ by less than this fraction of the largest.
@@ -29,30 +29,30 @@ ROUNDING = 1e-13
 
 
 def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Mass, tensor about the centre of mass or pivot, centre of mass from there, points to draw and their names."""
-    table_ = scene.body
-    centre = np.array(table_.centre_of_mass_m or (0.0, 0.0, 0.0))
-    mass = table_.mass_kg or 0.0  # of points it is their sum
-    tensor = table_.tensor
-    if table_.points is not None:
-        masses = np.array([p.mass_kg for p in table_.points])
-        places = np.array([p.position_m for p in table_.points])
+    """Mass, inertia tensor about the centre of mass or pivot, centre of mass from there, points to draw, their names."""
+    body = scene.body
+    centre = np.array(body.centre_of_mass_m or (0.0, 0.0, 0.0))
+    mass = body.mass_kg or 0.0  # with points: their sum, below
+    tensor = body.tensor
+    if body.points is not None:
+        masses = np.array([p.mass_kg for p in body.points])
+        positions = np.array([p.position_m for p in body.points])
         mass = float(masses.sum())
-        centre = masses @ places / mass
-        points = places - centre
+        centre = masses @ positions / mass
+        points = positions - centre
         tensor = inertia_tensor(masses, points)
-    elif table_.solid is not None:
-        shape = solid(table_.solid.shape, mass, table_.solid.dimensions)
+    elif body.solid is not None:
+        shape = solid(body.solid.shape, mass, body.solid.dimensions)
         points, tensor = shape.outline, np.diag(shape.inertia)
     else:
         about_centre = np.zeros((3, 3)) if tensor is None else tensor
-        if table_.inertia_about == "pivot":
+        if body.inertia_about == "pivot":
             about_centre = shifted_inertia(about_centre, -mass, centre)
         points = _equal_ellipsoid(mass, about_centre)
     if tensor is None:
         tensor = np.zeros((3, 3))
-    if table_.pinned:
-        if table_.inertia_about == "centre_of_mass":
+    if body.pinned:
+        if body.inertia_about == "centre_of_mass":
             tensor = shifted_inertia(tensor, mass, centre)
         points = np.vstack([np.zeros(3), centre + points])
         return mass, tensor, centre, points, ("PIVOT", *(f"P{k}" for k in range(1, len(points))))
@@ -60,7 +60,7 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
 
 
 def inertia_at_centre(scene: BodyScene) -> np.ndarray:
-    """The inertia tensor (3, 3) about the centre of mass, of a changing one that of the start."""
+    """The inertia tensor (3, 3) about the centre of mass, at the start."""
     if scene.changing_inertia is not None:
         return np.diag(scene.changing_inertia.inertia_kg_m2[0])
     mass, tensor, centre, _, _ = inertia_of(scene)
@@ -93,7 +93,7 @@ def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_rounding(moments: np.ndarray) -> np.ndarray:
-    """Moments with differences by rounding removed: equal to the last bit, so that the rotor is exact, or zero."""
+    """Moments that differ from each other or from 0 by rounding, made equal or 0, so that the rotor is exact."""
     rounding = ROUNDING * moments.max()
     moments = np.where(moments < rounding, 0.0, moments)
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -108,12 +108,8 @@ def carried_fluid(scene: BodyScene) -> tuple[np.ndarray, np.ndarray, float]:
     if fluid is None:
         return np.zeros(3), np.zeros(3), 0.0
     if fluid.density_kg_m3 is None:
-        zero = (0.0, 0.0, 0.0)
-        return (
-            np.array(fluid.added_mass_kg or zero),
-            np.array(fluid.added_inertia_kg_m2 or zero),
-            fluid.displaced_mass_kg or 0.0,
-        )
+        mass, inertia = (np.array(added or np.zeros(3)) for added in (fluid.added_mass_kg, fluid.added_inertia_kg_m2))
+        return mass, inertia, fluid.displaced_mass_kg or 0.0
     shape = not_none(scene.body.solid)
     half = np.array(shape.semi_axes_m or (shape.radius_m,) * 3)
     return *added_mass_of_ellipsoid(half, fluid.density_kg_m3), fluid.density_kg_m3 * 4 / 3 * np.pi * half.prod()
@@ -137,7 +133,7 @@ def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, a
 
 
 def _time_function(timed: Timed, values) -> TimeFunction:
-    """The course of a value: constant, within a window of time, or from a table."""
+    """A value as a function of time: constant, within a window of time, or from a table."""
     if timed.times_s is not None:
         return interpolated_function(timed.times_s, values)
     if timed.from_s is not None or timed.to_s is not None:
@@ -156,32 +152,30 @@ def frame_of(scene: BodyScene):
 
 
 def resistance_of(scene: BodyScene):
-    friction, fluid = scene.friction, scene.fluid
-    zero = (0.0, 0.0, 0.0)
+    friction, fluid = scene.friction or Friction(), scene.fluid or Fluid()
     parts = (
-        np.array(fluid.linear_resistance_kg_s if fluid else zero),
-        np.array(fluid.quadratic_resistance_kg_m if fluid else zero),
-        np.array(friction.dry_N_m if friction else zero),
-        np.array(friction.viscous_N_m_s if friction else zero)
-        + np.array(fluid.linear_rotational_resistance_N_m_s if fluid else zero),
-        np.array(fluid.quadratic_rotational_resistance_N_m_s2 if fluid else zero),
+        np.array(fluid.linear_resistance_kg_s),
+        np.array(fluid.quadratic_resistance_kg_m),
+        np.array(friction.dry_N_m),
+        np.array(friction.viscous_N_m_s) + np.array(fluid.linear_rotational_resistance_N_m_s),
+        np.array(fluid.quadratic_rotational_resistance_N_m_s2),
     )
     return Resistance(*parts) if any(part.any() for part in parts) else NoResistance()
 
 
 def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, displaced: float):
     terms = {}
-    where = axes.T @ centre
+    at_centre = axes.T @ centre
     if scene.gravity is not None:
         g = np.array(scene.gravity.acceleration_m_s2)
-        terms["gravity"] = SteadyForce(mass * g, where)
+        terms["gravity"] = SteadyForce(mass * g, at_centre)
         if displaced:
-            buoyed = not_none(scene.fluid).centre_of_buoyancy_m
-            at = centre if buoyed is None else np.array(buoyed)
+            buoyancy = not_none(scene.fluid).centre_of_buoyancy_m
+            at = centre if buoyancy is None else np.array(buoyancy)
             terms["buoyancy"] = SteadyForce(-displaced * g, axes.T @ at)
     if scene.frame is not None and scene.frame.origin_acceleration_m_s2 is not None:
-        course = _time_function(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
-        terms["origin_acceleration"] = _force(course, constant_function(np.zeros(3)), where, False)
+        force = _time_function(scene.frame, -mass * np.array(scene.frame.origin_acceleration_m_s2))
+        terms["origin_acceleration"] = _force(force, constant_function(np.zeros(3)), at_centre, False)
     for k, entry in enumerate(scene.applied):
         force, torque = (
             constant_function(np.zeros(3)) if given is None else _time_function(entry, given)
@@ -189,9 +183,8 @@ def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray
         )
         if entry.axes == "body":
             force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)
-        terms[f"applied_{k}"] = _force(
-            force, torque, axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0)), entry.axes == "body"
-        )
+        at = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
+        terms[f"applied_{k}"] = _force(force, torque, at, entry.axes == "body")
     return terms
 
 
@@ -200,7 +193,7 @@ def _rotated(course: TimeFunction, matrix: np.ndarray) -> TimeFunction:
 
 
 def _force(force: TimeFunction, torque: TimeFunction, point: np.ndarray, follows_body: bool):
-    """The term of a force: a constant one in the lab has a potential energy, of any other the work is recorded."""
+    """The term of a force: with a potential energy if it is constant in the lab, else the ledger has its work."""
     if not follows_body and is_constant_function(force) and is_constant_function(torque) and not torque.constant.any():
         return SteadyForce(force.constant[0], point)
     return TimeDependentForce(force, torque, point, follows_body)

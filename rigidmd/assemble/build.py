@@ -1,12 +1,11 @@
-"""The system of a scene of molecules: species, model, start, terms. Faults are collected and raised together."""
+"""The system of a scene of molecules: species, model, start, terms. All errors are collected and raised together."""
 
 from dataclasses import replace
 from math import inf
 
 import numpy as np
 
-from rigidmd.assemble.defaults import Composition, with_defaults, with_momentum_removal
-from rigidmd.assemble.engine_defaults import with_engine_defaults
+from rigidmd.assemble.defaults import Composition, with_defaults, with_engine_defaults, with_momentum_removal
 from rigidmd.assemble.fields import SystemParts, field_notes, field_terms, fields_left_out, wrapped_between_walls
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.overlaps import overlaps
@@ -27,59 +26,50 @@ from rigidmd.scene.models import Molecule
 from rigidmd.scene.user_code import missing_user_code
 
 
-def build(scene: MolecularScene, bare: bool = False) -> System:
-    """The system of a scene. Raises SceneError, StructureError or MoleculeError, each with every fault it found.
+def build(scene: MolecularScene, user_code: bool = True) -> System:
+    """The system of a scene. Raises SceneError, StructureError or MoleculeError, with all errors found.
 
-    bare : leave out what users add, their code too; for looking at a run that has ended
+    user_code : whether to run the code of users; without it their terms are missing, which analyses do not need
     """
-    scene, handover_notes = with_engine_defaults(scene)
+    scene, engine_notes = with_engine_defaults(scene)
     species = species_of(scene)
-    arrangement = starting_configuration(scene, species)
-    space, number = space_of(arrangement.cell), residue_numbers(arrangement)
-    species, index, frozen, faults = split_frozen(scene, species, arrangement.species, number)
+    start = starting_configuration(scene, species)
+    space, number = space_of(start.cell), residue_numbers(start)
+    species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
-    resolved = with_defaults(scene, Composition(species, counts, space, arrangement.basis))
+    resolved = with_defaults(scene, Composition(species, counts, space, start.basis))
     if faults := [*faults, *resolved.faults]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
     model = _model(species, index, frozen)
-    turning = any(m.inertia.any() for m in species)
     state = state_of(
-        position=wrapped_between_walls(scene, space, arrangement.position),
-        rotation=arrangement.rotation if turning else None,
-        cell=arrangement.cell,
+        position=wrapped_between_walls(scene, space, start.position),
+        rotation=start.rotation if any(m.inertia.any() for m in species) else None,
+        cell=start.cell,
     )
-    acting = interactions(scene, species, model, space, state, arrangement.basis, resolved.pme_grid)
-    acting.terms.update(field_terms(scene, SystemParts(species, model, space, scene.forces.cutoff_A or inf, state, number)))
+    acting = interactions(scene, species, model, space, state, start.basis, resolved.pme_grid)
+    parts = SystemParts(species, model, space, scene.forces.cutoff_A or inf, state, number)
+    acting.terms.update(field_terms(scene, parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
     system = System(
-        scene=scene,
-        species=species,
-        model=model,
-        space=space,
-        state=state,
-        terms=acting.terms,
-        freedom=count_degrees_of_freedom(model),
-        constants=acting.constants,
-        constant_pressure=acting.pressure,
-        tail=acting.tail,
-        residue_number=number,
-        from_lattice=scene.structure is None,
+        scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
+        freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,
+        tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
         left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
         force_error=acting.force_error,
-        notes=[*handover_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
-    )
-    if not bare:
+        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+    )  # fmt: skip
+    if user_code:
         if scene.from_python != scene.user_code.names:
             raise SceneError(scene.source, [missing_user_code(scene.from_python, scene.user_code.names)])
         if scene.forces.custom or scene.from_python:
             system = with_user_code(system)
             scene, model = system.scene, system.model
-    if tied := system.position_dependent:
-        words = ", ".join(name.replace("_", " ") for name in tied)
+    if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
         faults = [
-            f"stages.{k}: {stage.ensemble} changes the box, and {words} depend on places in it: keep the volume"
+            f"stages.{k}: {stage.ensemble} changes the box, and {names} depend on absolute positions in it: "
+            "keep the volume"
             for k, stage in enumerate(scene.stages)
             if stage.changes_box
         ]
@@ -88,49 +78,49 @@ def build(scene: MolecularScene, bare: bool = False) -> System:
     check_memory(system)
     system.notes.extend(scene.rounded_times())
     system.notes.extend(
-        f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and there is no temperature; "
-        "thermostat = 'langevin' moves it"
+        f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and no temperature is defined; "
+        "use thermostat = 'langevin'"
         for k, stage in enumerate(scene.stages)
         if not stage.is_minimisation and len(index) and system.freedom_in(k).total == 0 and mobile(model).any()
     )
-    system.notes.extend(set_momenta(scene, model, state, arrangement))
+    system.notes.extend(set_momenta(scene, model, state, start))
     system.notes.extend(
-        f"{m.name} was made with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
+        f"{m.name} was developed with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
         for m in {m.name: m for m in species}.values()
         if m.mixing not in (None, scene.forces.mixing)
     )
     if scene.structure is not None:
         system.notes.append(
-            f"{len(index)} molecules read from {scene.structure.file}; atoms against rigid templates: "
-            f"rms {arrangement.residual_rms:.4f} Å, largest {arrangement.residual_max:.4f} Å"
+            f"{len(index)} molecules read from {scene.structure.file}; distances of atoms from rigid templates: "
+            f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
         )
-        system.notes.extend(f"{scene.structure.file}: {note}" for note in arrangement.notes)
+        system.notes.extend(f"{scene.structure.file}: {note}" for note in start.notes)
         if faults := overlaps(system):
             if not scene.stages[0].is_minimisation:
                 raise StructureError(scene.structure_source, faults)
-            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation moves them apart")
+            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation separates them")
     else:
-        system.notes.extend(f"box: {note}" for note in arrangement.notes)
+        system.notes.extend(f"box: {note}" for note in start.notes)
     return system
 
 
 def with_user_code(system: System) -> System:
-    """The system with what users add. Raises SceneError with every fault."""
+    """The system with the terms and the thermostat of users. Raises SceneError with all errors."""
     from rigidmd.assemble.user_code.binding import user_terms
 
     added = user_terms(system)
-    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.moves)
+    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.changes_momentum)
     return replace(
         system,
         scene=with_momentum_removal(system.scene, model.keeps_momentum),
-        # those that Python computes come first: until they are told, nothing else need be computed
+        # Forces computed by Python come first: as long as they are missing, no other need be computed.
         terms={name: added.terms[name] for name in added.python_forces} | system.terms | added.terms,
         model=model,
         freedom=count_degrees_of_freedom(model),
         python_forces=added.python_forces,
         thermostat=added.thermostat,
         tail=sum_of_tails([*([system.tail] if system.tail is not None else []), *added.tails]),
-        user_terms=added.words,
+        user_terms=added.descriptions,
         notes=[*system.notes, *added.notes],
     )
 

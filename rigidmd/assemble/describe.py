@@ -31,13 +31,13 @@ PRECISIONS = {
 }
 
 
-def describe(scene: MolecularScene | BodyScene, bare: bool = False) -> str:
+def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
     """How a scene would run, in words. Raises what building its system raises.
 
-    bare : leave out what users add, see `build`
+    user_code : see `build`
     """
     if isinstance(scene, MolecularScene):
-        return _molecules(build(scene, bare))
+        return _molecules(build(scene, user_code))
     text = _body(build_body(scene))
     if scene.run.is_auto:
         text += "\nthe integrator is chosen before the run, and its step, at most this one"
@@ -70,7 +70,7 @@ def _body(system: BodySystem) -> str:
     if isinstance(system.method, Scheme):
         turned = system.engine().model_for(system.method)
         body = turned if isinstance(turned, Body) else body
-    parts = [body.flight, body.rotor, body.frame, body.resistance]
+    parts = [body.translation, body.rotor, body.frame, body.resistance]
     lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
     lines.append("left out:")
@@ -139,7 +139,7 @@ def _molecules(system: System) -> str:
 def _term(system: System, name: str, term: NamedTuple) -> str:
     if not isinstance(term, PairForces):
         return type(term).__name__
-    reach = f"cut-off {system.cutoff:g} Å" if system.cutoff < inf else "no cut-off"
+    reach = f"cutoff {system.cutoff:g} Å" if system.cutoff < inf else "no cutoff"
     if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
         reach += f", {system.scene.forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"

@@ -1,4 +1,4 @@
-"""The electrostatics of a resolved scene: pair law, reciprocal part, constants of rigid molecules."""
+"""The electrostatics of a resolved scene: pair potential, reciprocal part, constants of rigid molecules."""
 
 from collections.abc import Callable
 from math import inf, pi
@@ -24,9 +24,9 @@ from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 #: A net charge below this fraction of the sum of |q| is rounding.
 NEUTRAL = 1e-10
-#: Error that polynomials in single precision may have between unit charges, as a fraction of the real-space error. With
-#: it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
-FIT_SHARE = 0.02
+#: Largest error of the polynomials in single precision between unit charges, as a fraction of the real-space error.
+#: With it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
+FIT_ERROR_FRACTION = 0.02
 
 Grid = tuple[int, int, int]
 
@@ -37,31 +37,33 @@ class ChargedSites(NamedTuple):
     species: list[Molecule]
     species_index: np.ndarray  # (n,) of each molecule
     frozen: np.ndarray  # (n,)
-    chosen: list[np.ndarray]  # charged sites of each species
+    indices: list[np.ndarray]  # charged sites of each species
     sites: BodySites | CentralSites
-    group: np.ndarray  # (s,) sites of one group do not act on one another
+    group: np.ndarray  # (s,) sites of one group do not act on each other
 
     @property
     def charge_e(self) -> np.ndarray:
         """Charges (s,) in e."""
-        return gather_per_molecule([m.charges[c] for m, c in zip(self.species, self.chosen, strict=True)], self.species_index)
+        return gather_per_molecule(
+            [m.charges[c] for m, c in zip(self.species, self.indices, strict=True)], self.species_index
+        )
 
     @property
     def summed(self) -> Charges:
         """All charges, in the form that error estimates need."""
         return charges_in(self.species, np.bincount(self.species_index, minlength=len(self.species)))
 
-    def each(self, what: Callable[[np.ndarray, np.ndarray], float]) -> float:
-        """Sum of what(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""
+    def sum_over_molecules(self, energy: Callable[[np.ndarray, np.ndarray], float]) -> float:
+        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""
         total = 0.0
-        for k, (m, c) in enumerate(zip(self.species, self.chosen, strict=True)):
+        for k, (m, c) in enumerate(zip(self.species, self.indices, strict=True)):
             count = int(((self.species_index == k) & ~self.frozen).sum())
-            total += count * what(m.charges[c] * COULOMB_CHARGE, m.positions_body[c]) if count else 0.0
+            total += count * energy(m.charges[c] * COULOMB_CHARGE, m.positions_body[c]) if count else 0.0
         return total
 
 
 class Interactions(NamedTuple):
-    """The interactions between molecules."""
+    """The terms, constants and corrections of the interactions between molecules."""
 
     terms: dict[str, NamedTuple]
     constants: dict[str, float]  # constant energies, u Å²/ps²
@@ -76,57 +78,69 @@ def electrostatics(
 ) -> Interactions:
     """The contributions of the charges of a resolved scene. Raises SceneError.
 
-    basis (3, 3) : integers, the edges of the box in those of the described cell, to which ewald_k_max refers
+    basis (3, 3) : integers, the edges of the box in terms of the edges of the given cell, to which ewald_k_max refers
     grid : of PME, along the edges of the box
     """
     forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
 
-    def between_pairs(law: NamedTuple) -> NamedTuple:
-        return pair_forces(law, charged.sites, charged.group)
+    def between_pairs(potential: NamedTuple) -> NamedTuple:
+        return pair_forces(potential, charged.sites, charged.group)
 
     charge = charged.charge_e
     if forces.electrostatics == "reaction_field":
         start = forces.switch_start_A or cutoff
-        law = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
-        own = charged.each(lambda q, x: self_energy(law._replace(charge=q), x)) if cutoff < inf else None
-        return Interactions({"coulomb": between_pairs(law)}, {} if own is None else {"reaction_field_self": own})
+        potential = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
+        constant = (
+            charged.sum_over_molecules(lambda q, x: self_energy(potential._replace(charge=q), x))
+            if cutoff < inf
+            else None
+        )
+        return Interactions(
+            {"coulomb": between_pairs(potential)}, {} if constant is None else {"reaction_field_self": constant}
+        )
     if forces.electrostatics == "damped_shifted_force":
-        law = damped_shifted_force(charge, cutoff, forces.damping_per_A)
-        own = charged.each(lambda q, x: damped_self_energy(law._replace(charge=q), x))
-        return Interactions({"coulomb": between_pairs(law)}, {"damped_self": own})
+        potential = damped_shifted_force(charge, cutoff, forces.damping_per_A)
+        constant = charged.sum_over_molecules(lambda q, x: damped_self_energy(potential._replace(charge=q), x))
+        return Interactions({"coulomb": between_pairs(potential)}, {"damped_self": constant})
     return _ewald(scene, charged, space, between_pairs, state, basis, grid)
 
 
 class _Ewald(NamedTuple):
-    """Truncation errors and waves of an Ewald sum."""
+    """Truncation errors and k-vectors of an Ewald sum."""
 
     real_error: float  # e²/Å², see ewald_errors
     k_space_error: float
-    waves: k_vectors.KVectors | None  # with PME only for the interactions of frozen molecules
+    vectors: k_vectors.KVectors | None  # with PME only for the interactions of frozen molecules
 
 
-def _waves(scene: MolecularScene, charged: ChargedSites, space: Space, basis: np.ndarray, grid: Grid | None) -> _Ewald:
-    """Waves and truncation errors of a resolved scene."""
+def _ewald_errors(
+    scene: MolecularScene, charged: ChargedSites, space: Space, basis: np.ndarray, grid: Grid | None
+) -> _Ewald:
+    """Truncation errors and k-vectors of a resolved scene."""
     forces, volume, cell = scene.forces, space.volume, cell_of(space)
     alpha, cutoff, charges = not_none(forces.ewald_alpha_per_A), not_none(forces.cutoff_A), charged.summed
-    beyond = real_error(charges, alpha, cutoff, volume)
+    of_real_space = real_error(charges, alpha, cutoff, volume)
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     if grid is not None:
-        left = pme_error(charges, alpha, cell, grid, not_none(forces.pme_order))
-        over = None
+        of_k_space = pme_error(charges, alpha, cell, grid, not_none(forces.pme_order))
+        vectors = None
         if charged.frozen.any():
-            over = k_vectors.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * left))
-        return _Ewald(beyond, left, over)
+            vectors = k_vectors.k_vectors_within(
+                reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * of_k_space)
+            )
+        return _Ewald(of_real_space, of_k_space, vectors)
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
         most = (most, most, most)
     if radius is None:
-        over = k_vectors.k_vectors_up_to(not_none(most), forces.ewald_k2_max, basis)
+        vectors = k_vectors.k_vectors_up_to(not_none(most), forces.ewald_k2_max, basis)
     else:
-        over = k_vectors.k_vectors_within(reciprocal, radius, most, basis)
-    if over.total == 0:
-        raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no wave at all"])
-    return _Ewald(beyond, k_space_error(charges, alpha, k_cutoff_of_count(over.total, volume), volume), over)
+        vectors = k_vectors.k_vectors_within(reciprocal, radius, most, basis)
+    if vectors.total == 0:
+        raise SceneError(scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"])
+    return _Ewald(
+        of_real_space, k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume), vectors
+    )
 
 
 def _ewald(
@@ -138,57 +152,61 @@ def _ewald(
     basis: np.ndarray,
     grid: Grid | None,
 ) -> Interactions:
-    forces, found = scene.forces, _waves(scene, charged, space, basis, grid)
+    forces, found = scene.forces, _ewald_errors(scene, charged, space, basis, grid)
     alpha, cutoff = not_none(forces.ewald_alpha_per_A), not_none(forces.cutoff_A)
     charge = charged.charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
-    law = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_SHARE * found.real_error)
+    potential = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * found.real_error)
     if grid is None:
-        waves = not_none(found.waves)
-        over = direct_sum.EwaldSum(alpha, charge, charged.sites, waves)
-        how = f"{waves.total} waves, |n| up to {' '.join(map(str, waves.most))}"
+        vectors = not_none(found.vectors)
+        reciprocal = direct_sum.EwaldSum(alpha, charge, charged.sites, vectors)
+        how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
         if forces.ewald_k_max is not None and not np.array_equal(basis, k_vectors.SAME_BASIS):
-            how += "; these are the waves that ewald_k_max means in the cell that was described"
+            how += "; they are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
         order = not_none(forces.pme_order)
-        over = Pme(alpha, charge, charged.sites, grid, order)
+        reciprocal = Pme(alpha, charge, charged.sites, grid, order)
         how = f"grid {' x '.join(map(str, grid))}, splines of order {order}"
-    terms = {"coulomb_real": between_pairs(law), "coulomb_reciprocal": over}
+    terms = {"coulomb_real": between_pairs(potential), "coulomb_reciprocal": reciprocal}
     constants = {
-        # The shift applies to all charges within the cut-off of a charge, its own molecule and itself included, which
-        # together are nearly neutral. The pair loop leaves out the latter; this constant adds them.
-        "coulomb_self": charged.each(
-            lambda q, x: corrections.self_energy(q, alpha) - 0.5 * law.shift * float(q.sum()) ** 2
+        # The shift applies to all charges within the cutoff of a charge, which together are nearly neutral, including
+        # the charge itself and its molecule. The pair loop leaves these out; this constant adds them.
+        "coulomb_self": charged.sum_over_molecules(
+            lambda q, x: corrections.self_energy(q, alpha) - 0.5 * potential.shift * float(q.sum()) ** 2
         ),
-        "coulomb_intramolecular": charged.each(lambda q, x: corrections.intramolecular_energy(q, x, alpha)),
+        "coulomb_intramolecular": charged.sum_over_molecules(
+            lambda q, x: corrections.intramolecular_energy(q, x, alpha)
+        ),
     }
     error = float(np.hypot(found.real_error, found.k_space_error))
     notes = [
-        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cut-off {cutoff:g} Å, {how}"
-        + ("" if law.shift == 0 else "; energies of real space shifted to 0 at the cut-off"),
+        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cutoff {cutoff:g} Å, {how}"
+        + ("" if potential.shift == 0 else "; energies of real space shifted to 0 at the cutoff"),
         f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
-        f"kJ/(mol Å); {found.real_error:.2g} beyond the cut-off, {found.k_space_error:.2g} in the reciprocal part",
+        f"kJ/(mol Å); {found.real_error:.2g} beyond the cutoff, {found.k_space_error:.2g} in the reciprocal part",
     ]
-    still = charged.frozen[charged.sites.molecule]
-    net, net_still = charge.sum(), charge[still].sum()
+    frozen_sites = charged.frozen[charged.sites.molecule]
+    net, net_frozen = charge.sum(), charge[frozen_sites].sum()
     neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
     if not neutral:
-        terms["coulomb_background"] = corrections.background(net**2 - net_still**2, alpha)
+        terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
         notes.append(
             f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
             "makes it neutral, and energies and pressure depend on the size of the box"
         )
     if (permittivity := forces.ewald_surface_permittivity) < inf:
         if not neutral:
-            fault = "forces.ewald_surface_permittivity: a box with a net charge has no dipole of its own; leave it out"
+            fault = (
+                "forces.ewald_surface_permittivity: the dipole of a box with a net charge is not defined; leave it out"
+            )
             raise SceneError(scene.source, [fault])
         terms["coulomb_surface"] = corrections.surface_dipole(charge, permittivity, charged.sites)
     pressure = 0.0
-    if still.any():
+    if frozen_sites.any():
         constants["coulomb_frozen"], pressure = _frozen_correction(
-            charged, charge * still, space, alpha, not_none(found.waves), permittivity, state
+            charged, charge * frozen_sites, space, alpha, not_none(found.vectors), permittivity, state
         )
     return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
 
@@ -198,11 +216,11 @@ def _frozen_correction(
     charge: np.ndarray,
     space: Space,
     alpha: float,
-    waves: k_vectors.KVectors,
+    vectors: k_vectors.KVectors,
     permittivity: float,
     state: State,
 ) -> tuple[float, float]:
-    """Constant energy and pressure that cancel the interactions of frozen molecules in sums over images.
+    """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images.
 
     charge (s,) : 0 for sites that move
     """
@@ -211,7 +229,7 @@ def _frozen_correction(
     if len(state.rotation):
         arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
     position = state.position[sites.molecule] + arms
-    energy, force, virial = direct_sum.ewald_sum_in_numpy(charge, position, cell_of(space), alpha, waves)
+    energy, force, virial = direct_sum.ewald_sum_in_numpy(charge, position, cell_of(space), alpha, vectors)
     dipole = charge @ position
     surface = 2 * pi / ((2 * permittivity + 1) * volume)
     force -= 2 * surface * charge[:, None] * dipole

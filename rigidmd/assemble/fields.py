@@ -121,7 +121,7 @@ def _gap_faults(scene: MolecularScene, parts: SystemParts, moves: np.ndarray) ->
             beyond = f", {2 * over:.3g} Å by which sites may stand out," if over else ""
             faults.append(
                 f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at least: {apart:g} Å "
-                f"between the walls{beyond} and the cut-off of {parts.cutoff:g} Å, so that what is at one wall does "
+                f"between the walls{beyond} and the cutoff of {parts.cutoff:g} Å, so that what is at one wall does "
                 "not meet the images of what is at the other"
             )
     return faults
@@ -173,40 +173,6 @@ def _restraints(scene: MolecularScene, k: int, parts: SystemParts, faults: list[
     return Restraints(molecule, np.array(place, float), np.array(entry.stiffness) * KJ_PER_MOL)
 
 
-def start_lattice(
-    scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """n points (n, 3) on a lattice in a box with edges (3,), between its walls and far enough from them.
-
-    Raises SceneError.
-    """
-    low, high, faults = np.zeros(3), edges.copy(), []
-    for axis, name in enumerate(AXES):
-        own = [walls for walls in scene.fields.walls if walls.direction == axis]
-        if not own:
-            continue
-        ends = [_range_of_centres(walls, species) for walls in own]
-        low[axis], high[axis] = max(end[0] for end in ends), min(end[1] for end in ends)
-        if low[axis] == -inf:
-            low[axis] = high[axis] - edges[axis]
-        elif high[axis] == inf:
-            high[axis] = low[axis] + edges[axis]
-        if not low[axis] < high[axis]:
-            faults.append(f"fields.walls: those across {name} leave no room for molecules to start between them")
-    if faults:
-        raise SceneError(scene.source, faults)
-    return low + lattice(n, high - low, rng)
-
-
-def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """n points (n, 3) on a nearly cubic lattice in a rectangular box with edges (3,), drawn at random."""
-    shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
-    while shape.prod() < n:
-        shape[np.argmax(edges / shape)] += 1
-    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    return (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
-
-
 def _range_of_centres(walls: Walls, species: list[Molecule]) -> tuple[float, float]:
     """Range of positions of centres of mass that is free for every orientation, Å."""
     reach = max(
@@ -243,7 +209,7 @@ def describe_fields(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict
         lower, upper = walls.positions_A
         kind = (
             f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g} kJ/mol, "
-            + (f"cut-off {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cut-off")
+            + (f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff")
             if walls.kind == "lj93"
             else f"harmonic, {walls.stiffness_kJ_mol_A2:g} kJ/mol/Å²"
         )

@@ -54,7 +54,9 @@ def massive_sites(molecule: Molecule) -> np.ndarray:
     return np.flatnonzero(molecule.masses > 0)
 
 
-def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float) -> MatchedMolecules | list[str]:
+def match(
+    atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float
+) -> MatchedMolecules | list[str]:
     """The molecules that the atoms form, or every reason why they form none.
 
     cell: lattice (3, 3) across whose faces molecules may be split, or None. tolerance: see Scene.structure.
@@ -82,7 +84,9 @@ def match(atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolera
     return by_bonds
 
 
-def refit(position: np.ndarray, matched: MatchedMolecules, species: list[Molecule], cell: np.ndarray | None) -> MatchedMolecules:
+def refit(
+    position: np.ndarray, matched: MatchedMolecules, species: list[Molecule], cell: np.ndarray | None
+) -> MatchedMolecules:
     """The same molecules where their atoms are now, position (a, 3), whatever their deviation."""
     centre, rotation = np.zeros_like(matched.centre), np.zeros_like(matched.rotation)
     deviation, square = np.zeros_like(matched.deviation), np.zeros_like(matched.square)
@@ -300,7 +304,9 @@ def _same(keys: Iterable[Hashable]) -> np.ndarray:
     return number[:, None] == number
 
 
-def _fit_group(atoms, runs, members, candidates, species, cell, tolerance, found: MatchedMolecules, faults: dict) -> None:
+def _fit_group(
+    atoms, runs, members, candidates, species, cell, tolerance, found: MatchedMolecules, faults: dict
+) -> None:
     """Fit runs of one composition to their candidates; write into `found` or `faults`."""
     fits = []
     for c in candidates:
@@ -323,7 +329,9 @@ def _fit_group(atoms, runs, members, candidates, species, cell, tolerance, found
             if len(faults) < MOST_NEAREST:  # of the best order
                 points = [_make_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
                 tried = zip(points, candidates, limits, off, strict=True)
-                off = [_least_deviation(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried]
+                off = [
+                    _least_deviation(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried
+                ]
             k = int(np.argmin(np.array(off) / limits))
             faults[m] = (
                 f"is no {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, more "
@@ -360,7 +368,9 @@ def _fit_in_any_order(
     return fit
 
 
-def _least_deviation(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float) -> float:
+def _least_deviation(
+    points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float
+) -> float:
     """The deviation of the atoms (s, 3) of a molecule in the best order that is found, for messages."""
     order = _search_order(points, molecule, allowed, NEAREST * limit, MOST_TRIES // 10)
     return deviation if order is None else min(deviation, float(_fit(points[None, order], molecule).deviation[0]))

@@ -29,7 +29,7 @@ BYTES_PER_SAMPLE = 2700
 #: Of a line of log.csv, which the run keeps as numbers; measured: 300 while it runs, 870 when it is summarised. Of a
 #: frame in a file, whose time is kept.
 BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
-ADVICE = "take fewer molecules, a smaller box or a shorter cut-off"
+ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
 
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:

@@ -9,6 +9,22 @@ from rigidmd.scene import BodyScene, MolecularScene
 
 if TYPE_CHECKING:
     import ase
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Unpack, cast
+
+import numpy as np
+
+from rigidmd.core.toml import plain_values
+from rigidmd.errors import RigidMDWarning, SceneError
+from rigidmd.io.cells import cell_fault
+from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
+from rigidmd.scene.molecules import STRUCTURE_NAME, Settings
+from rigidmd.scene.species import SPECIES_FILES
+
+if TYPE_CHECKING:
+    import ase
 
 AnyScene = TypeVar("AnyScene", MolecularScene, BodyScene)
 
@@ -26,3 +42,151 @@ def atoms_of(scene: MolecularScene) -> "ase.Atoms":
     """The start of a run as an `ase.Atoms`, before overlaps are removed: see `Results.atoms`. Raises as `resolve`."""
     system = build(scene)
     return atoms_of_system(system, system.state)
+
+
+#: Duration of a first stage that nobody asked for, ps.
+DURATION = 1.0
+#: What messages call them.
+SOURCE = "atoms"
+
+
+def scene_from_atoms(
+    atoms: "ase.Atoms", models: str | Sequence[str | Mapping[str, Any]], **settings: Unpack[Settings]
+) -> MolecularScene:
+    """The scene of an `ase.Atoms`, whose atoms become molecules as those of a structure file do.
+
+    Its cell, its periodicity (along all axes or none) and its momenta are taken. Massless sites, as the M of TIP4P,
+    need not be among the atoms. The scene holds the atoms; a run in a folder writes them there.
+
+    models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
+    settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
+        start={"temperature_K": 300} draws momenta in place of those of the atoms. Without stages there is one: 1 ps
+        of nve, or a minimisation where neither atoms nor settings give momenta
+
+    Raises SceneError; that the atoms are no molecules of these models is found when the system is built.
+    """
+    if faults := atoms_faults(atoms):
+        raise SceneError(SOURCE, faults)
+    data = plain_values(settings)
+    faults = [f"{key} is given by the atoms and models" for key in ("molecules",) if key in data]
+    structure, start, box = (data.setdefault(key, {}) for key in ("structure", "start", "box"))
+    if faults := faults + _faults_of_tables(data):
+        raise SceneError(SOURCE, faults)
+    has_momenta = atoms.has("momenta")
+    draws = start.get("temperature_K") is not None
+    structure["file"] = STRUCTURE_NAME
+    structure.setdefault("velocities", has_momenta and not draws)
+    if not atoms.pbc.any():
+        box.setdefault("periodic", False)
+    if "stages" not in data:
+        moves = structure["velocities"] or draws
+        data["stages"] = [{"duration_ps": DURATION} if moves else {"ensemble": "minimise"}]
+    data["molecules"] = _entries(models)
+    data.setdefault("name", atoms.get_chemical_formula()[:40])
+    _warn_of_constraints(atoms)
+    found = MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
+    return cast(MolecularScene, found)
+
+
+def atoms_faults(atoms: Any) -> list[str]:
+    """Why an object is no `ase.Atoms` of which molecules could be made."""
+    import ase
+
+    if not isinstance(atoms, ase.Atoms):
+        more = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
+        return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{more}"]
+    if len(atoms) == 0:
+        return ["there are none"]
+    values = [("position", atoms.positions)]
+    if atoms.has("momenta"):
+        values.append(("momentum", atoms.get_momenta()))
+    if atoms.has("masses"):
+        values.append(("mass", atoms.get_masses()[:, None]))
+    faults = []
+    for what, array in values:
+        if not (fine := np.isfinite(array).all(axis=1)).all():
+            faults.append(f"atoms[{np.argmin(fine)}] has a {what} that is not a finite number")
+    if atoms.pbc.any() and not atoms.pbc.all():
+        axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
+        faults.append(
+            f"they are periodic along {axes} only: set pbc along all three axes or none (a slab can have a long cell)"
+        )
+    elif atoms.pbc.all():
+        cell = atoms.cell.array
+        fault = cell_fault(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
+        if fault:
+            faults.append(f"they are periodic, but of their cell: {fault}. Set atoms.cell, or atoms.pbc = False")
+    return faults
+
+
+def text_of(atoms: "ase.Atoms") -> str:
+    """Atoms as extended XYZ, every number to the last bit; a cell only if they are periodic."""
+    columns = [("species", "S", [[symbol] for symbol in atoms.get_chemical_symbols()])]
+    columns.append(("pos", "R", _digits(atoms.positions)))
+    if atoms.has("momenta"):
+        columns.append(("momenta", "R", _digits(atoms.get_momenta())))
+    if atoms.has("masses"):
+        columns.append(("masses", "R", _digits(atoms.get_masses()[:, None])))
+    for name, kind in ((NAMES, "S"), (RESIDUE_NAMES, "S"), (RESIDUE_NUMBERS, "I")):
+        values = [str(value) for value in atoms.arrays.get(name, ())]
+        if values and all(value.isprintable() and len(value.split()) == 1 for value in values):
+            columns.append((name, kind, [[value] for value in values]))
+    about = ":".join(f"{name}:{kind}:{len(rows[0])}" for name, kind, rows in columns)
+    box = 'pbc="F F F"'
+    if atoms.pbc.all():
+        # ASE takes a number without a point for a whole one
+        [edges] = _digits(atoms.cell.array.reshape(1, 9))
+        edges = " ".join(text if "." in text else f"{float(text):.16e}" for text in edges)
+        box = f'Lattice="{edges}" pbc="T T T"'
+    lines = (" ".join(word for row in rows for word in row) for rows in zip(*(c[2] for c in columns), strict=True))
+    return "\n".join([str(len(atoms)), f"{box} Properties={about}", *lines]) + "\n"
+
+
+def _digits(values: np.ndarray) -> list[list[str]]:
+    """The shortest texts of numbers (n, k) that are read as the same numbers."""
+    return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
+
+
+def _faults_of_tables(data: Mapping[str, Any]) -> list[str]:
+    """Faults of tables that the atoms fill in."""
+    faults = [
+        f"{key} is a {type(data[key]).__name__}, must be a dictionary like the table [{key}] of a scene file"
+        for key in ("structure", "start", "box")
+        if not isinstance(data[key], Mapping)
+    ]
+    if faults:
+        return faults
+    return [
+        f"structure.{key} is given by the atoms" for key in ("file", "frame", "topology") if key in data["structure"]
+    ]
+
+
+def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Tables [[molecules]] of models. Files are absolute, or the scene would depend on the working directory."""
+    found = []
+    models = plain_values(models)
+    for entry in models if isinstance(models, list) else [models]:
+        if isinstance(entry, dict):
+            paths = {key: os.path.abspath(entry[key]) for key in SPECIES_FILES if isinstance(entry.get(key), str)}
+            found.append(entry | paths)
+        elif isinstance(entry, str) and entry.endswith(".toml"):
+            found.append({"file": os.path.abspath(entry)})
+        else:
+            found.append({"model": entry})
+    return found
+
+
+def _warn_of_constraints(atoms: "ase.Atoms") -> None:
+    """Warn of constraints that hold more than the shape of molecules."""
+    held = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
+    if held:
+        warnings.warn(
+            f"the constraints of the atoms are not taken over ({', '.join(held)}): molecules stay put that the models "
+            'call frozen, models=[{"model": "spce", "frozen": [1, 2]}]',
+            RigidMDWarning,
+            stacklevel=4,
+        )
+
+
+#: Constraints that a rigid molecule fulfils by itself.
+SHAPES = {"FixLinearTriatomic", "FixInternals"}

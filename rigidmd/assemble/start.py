@@ -1,10 +1,11 @@
 """The start of a scene of molecules: positions, orientations and momenta."""
 
+from math import inf
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.fields import start_lattice
+from rigidmd.assemble.fields import _range_of_centres
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.assemble.structure import Configuration, read_structure, with_reduced_cell
 from rigidmd.core.state import State
@@ -15,6 +16,7 @@ from rigidmd.errors import SceneError, StructureError
 from rigidmd.io.cells import cell_fault
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.fields import AXES
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import not_none
 from rigidmd.units import GRAM_PER_CM3
@@ -101,3 +103,37 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: 
     temperature = not_none(scene.start.temperature_K)
     draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
     return []
+
+
+def start_lattice(
+    scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """n points (n, 3) on a lattice in a box with edges (3,), between its walls and far enough from them.
+
+    Raises SceneError.
+    """
+    low, high, faults = np.zeros(3), edges.copy(), []
+    for axis, name in enumerate(AXES):
+        own = [walls for walls in scene.fields.walls if walls.direction == axis]
+        if not own:
+            continue
+        ends = [_range_of_centres(walls, species) for walls in own]
+        low[axis], high[axis] = max(end[0] for end in ends), min(end[1] for end in ends)
+        if low[axis] == -inf:
+            low[axis] = high[axis] - edges[axis]
+        elif high[axis] == inf:
+            high[axis] = low[axis] + edges[axis]
+        if not low[axis] < high[axis]:
+            faults.append(f"fields.walls: those across {name} leave no room for molecules to start between them")
+    if faults:
+        raise SceneError(scene.source, faults)
+    return low + lattice(n, high - low, rng)
+
+
+def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """n points (n, 3) on a nearly cubic lattice in a rectangular box with edges (3,), drawn at random."""
+    shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
+    while shape.prod() < n:
+        shape[np.argmax(edges / shape)] += 1
+    points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    return (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape

@@ -100,7 +100,7 @@ def read_structure(
 
 
 def with_reduced_cell(found: Configuration, whose: str, may_turn: bool) -> Configuration:
-    """The same crystal or liquid in a cell with small tilts; rotated, if that allows a longer cut-off.
+    """The same crystal or liquid in a cell with small tilts; rotated, if that allows a longer cutoff.
 
     whose : owner of the lattice, for the note
     """

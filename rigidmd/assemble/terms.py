@@ -67,7 +67,8 @@ def interactions(
         sites = _sites_of(species, model, chosen)
         found.terms["lennard_jones"] = pair_forces(law, sites, exclusion_groups(sites, frozen))
         found = found._replace(
-            tail=tail(law) if scene.forces.tail_correction else None, notes=_short_cutoff_notes(law, species, index, chosen)
+            tail=tail(law) if scene.forces.tail_correction else None,
+            notes=_short_cutoff_notes(law, species, index, chosen),
         )
     chosen = [np.flatnonzero(m.charges != 0) for m in species]
     if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
@@ -117,7 +118,9 @@ def _lennard_jones(
     return law
 
 
-def _short_cutoff_notes(law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]) -> tuple[str, ...]:
+def _short_cutoff_notes(
+    law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]
+) -> tuple[str, ...]:
     """A note if the cutoff is within the minimum of an energy, on the pair with the most distant one."""
     with np.errstate(divide="ignore", invalid="ignore"):
         minimum = np.nan_to_num((2 * law.c12 / law.c6) ** (1 / 6), posinf=0.0)

@@ -30,11 +30,11 @@ BODY_HEADERS = {column.header: name for name, column in BODY_COLUMNS.items()}
 
 @dataclass(frozen=True)
 class Record:
-    """A run as its folder tells it.
+    """The contents of the folder of a run.
 
-    summary : None of a run that did not end
-    columns : (t,) each; of molecules by the names of `results[...]`, of a body by those of `BODY_COLUMNS`
-    missing : sentences about what is not there, and why
+    summary : None if the run has not ended
+    columns : (t,) each, by the names of `results[...]`
+    missing : sentences about data that are missing, and why
     """
 
     folder: Path
@@ -89,7 +89,7 @@ def read_record(folder: Path) -> Record:
         system = build_body(scene)
         columns = _motion(folder, system, missing)
     else:
-        system = build(scene, bare=True)
+        system = build(scene, user_code=False)
         columns = _log(folder, scene.stages)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(
@@ -113,10 +113,12 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
     """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
     read = read_columns(folder / LOG)
     if read is None:
-        raise OutputError(f"{folder / LOG} cannot be read: the file does not exist")
+        raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
     headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
     if lacking := [name for name in ("time", "stage_name") if name not in headers]:
-        raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}")
+        raise OutputError(
+            f"{read.path} is not a log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}"
+        )
     found = {
         name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
         for name, header in headers.items()

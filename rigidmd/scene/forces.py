@@ -106,7 +106,7 @@ class CustomForce(Section):
             if idle:
                 raise ValueError(f"{', '.join(idle)} would do nothing with a module: its object has `parameters`")
             if not self.module.endswith(".py"):
-                raise ValueError(f"module = {shorten_repr(self.module)} must be a Python file, ending in .py")
+                raise ValueError(f"module = {shorten_repr(self.module)} must be a Python file (.py)")
         return self
 
 

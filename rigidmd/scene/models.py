@@ -360,7 +360,7 @@ def model_fault(name: str) -> str:
     known = available_models()
     if name in known:
         return ""
-    return f"there is no model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all {len(known)}"
+    return f"unknown model {name!r}{did_you_mean(name, known) or ';'} `rigidmd models` lists all {len(known)}"
 
 
 def load_model(name: str) -> Molecule:

@@ -80,7 +80,7 @@ class Output(Section):
         if self.velocities and (self.trajectory is False or not self.trajectory.endswith(WITH_VELOCITIES)):
             raise ValueError(
                 f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; "
-                f"use one ending in {' or '.join(WITH_VELOCITIES)}"
+                f"use a {' or '.join(WITH_VELOCITIES)} file"
             )
         if self.topology == self.trajectory:
             raise ValueError(f"topology and trajectory are both {self.topology}; give them different names")
@@ -214,7 +214,7 @@ class MolecularScene(Scene):
     def _faults(self):
         if self.structure is None:
             yield from [
-                f"molecules.{k}.count is missing (there is no structure file to count in)"
+                f"molecules.{k}.count is missing (required without a structure file)"
                 for k, species in enumerate(self.molecules)
                 if species.count is None
             ]

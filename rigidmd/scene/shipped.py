@@ -27,7 +27,7 @@ KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
 #: In the order of the list.
 CHAPTERS = (
     "top", "water", "molecule", "ensembles", "looking", "notebook", "measuring", "studies", "ase", "engines",
-    "extending", "manual", "benchmarks", "validation", "changelog",
+    "extending", "architecture", "manual", "benchmarks", "validation", "changelog",
 )  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def find_example(name: str) -> Example:
     near = [other for other in known if other == stem or other.startswith(f"{stem}_")]
     near = near or difflib.get_close_matches(stem, known, 3, 0.6)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise InputError("examples", [f"there is no scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
+    raise InputError("examples", [f"unknown scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
 
 
 def series_of(name: str) -> list[str]:
@@ -130,7 +130,7 @@ def chapter_text(name: str) -> str:
         found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
         named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
         where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
-        raise InputError("help", [f"there is no chapter {name!r}; {hint}{where}"])
+        raise InputError("help", [f"unknown chapter {name!r}; {hint}{where}"])
     return _plain(name)
 
 

@@ -37,7 +37,7 @@ class Molecules(Section):
     """Number of molecules; required without a structure file"""
     frozen: Flag | tuple[ResidueNumber, ...] | str = False
     """Molecules that do not move. They act on all others but not on each other. True for all, or numbers of some,
-    [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, if there is no file or its residues are not the
+    [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a file or if its residues are not the
     molecules, 1, 2, ... within this species"""
 
     @field_validator("frozen")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 
 class UserCode(NamedTuple):
-    """Objects that `rigidmd.assemble.user_code` turns into terms of a system."""
+    """Forces and a thermostat, from which `rigidmd.assemble.user_code` makes terms."""
 
     forces: tuple[Any, ...] = ()
     thermostat: Any = None

@@ -10,8 +10,7 @@ import numpy as np
 from rigidmd.analysis.files import drawn, read_findings
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
-from rigidmd.core.statistics import mean, with_error
-from rigidmd.figures.run import signed
+from rigidmd.core.statistics import format_signed, format_with_error, mean
 from rigidmd.io.folder import SCENE
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
@@ -97,7 +96,7 @@ def _means(record: Record) -> str:
                 cells.append(f"{values[0]:.6g}")
                 continue
             value, error = mean(values)
-            cells.append("" if value is None else with_error(value, error))
+            cells.append("" if value is None else format_with_error(value, error))
         rows.append(cells)
     told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, of few lines no error."
     told = f'<p class="faint">{told}</p>'
@@ -112,7 +111,7 @@ def _drifts(record: Record) -> str:
         for value in ("drift_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom"):
             error = value.replace("drift_", "drift_error_")
             known = stage.get(value) is not None and stage.get(error) is not None
-            cells.append(signed(stage[value], stage[error]) if known else "")
+            cells.append(format_signed(stage[value], stage[error]) if known else "")
         cells += [_number(stage.get("energy_rms_kJ_mol_per_molecule")), _number(stage.get("ns_per_day"))]
         rows.append(cells)
     titles = ["stage", "integrator", "step (fs)", "drift (kJ/mol/ns per molecule)",
@@ -125,7 +124,7 @@ def _analyses(record: Record) -> Iterator[str]:
     rows, left_out, figures, stretches = [], [], [], []
     for finding, stretch in read_findings(record.folder):
         for value in finding.values:
-            told = "" if value.value is None else with_error(value.value, value.error)
+            told = "" if value.value is None else format_with_error(value.value, value.error)
             time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
             rows.append([value.name, told, value.unit if told and value.unit != "1" else "", time, value.note])
         if not finding.values and not finding.curves:
@@ -183,7 +182,7 @@ def _margins(record: Record) -> str:
                 [stage["name"], f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * share:.2g} %",
                  Raw(f'<span class="{kind}">{word}</span>')]
             )  # fmt: skip
-    more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd precision --averages`."
+    more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
     told = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
     titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "share", ""]
     return table(titles, rows) + told if rows else ""
@@ -195,7 +194,7 @@ MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf")
 
 def _told(record: Record) -> tuple[str, list[str]]:
     """What `rigidmd check` says: of the run, and what is left out."""
-    lines = describe(record.scene, bare=True).splitlines()
+    lines = describe(record.scene, user_code=False).splitlines()
     if "left out:" not in lines:
         return "\n".join(lines), []
     start = lines.index("left out:")

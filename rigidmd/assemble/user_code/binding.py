@@ -36,7 +36,7 @@ class UserTerms(NamedTuple):
     thermostat: Any
     notes: list[str]
     words: dict[str, str]  # what each term is
-    tails: list[Tail]  # what the cut-offs of pair laws take away
+    tails: list[Tail]  # what the cutoffs of pair laws take away
 
 
 def custom_forces(scene: "MolecularScene") -> list[Any]:
@@ -152,9 +152,7 @@ def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTupl
             found.tails.append(law.tail)
         cutoff = made.cutoff_A or system.cutoff
         reach = (
-            f"cut-off {cutoff:g} Å, {made.truncation or system.scene.forces.truncation}"
-            if cutoff < inf
-            else "no cut-off"
+            f"cutoff {cutoff:g} Å, {made.truncation or system.scene.forces.truncation}" if cutoff < inf else "no cutoff"
         )
         found.words[name] = f"{law.formula.text}, {len(law.term.group)} sites, {reach}"
         return law.term
@@ -171,7 +169,7 @@ def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTupl
         except (Exception, SystemExit) as error:  # whatever a stranger's code raises
             raise ValueError(f"term(system) raised {describe_error(error)}") from error
     if isinstance(made, PairForces):  # of a law that is not a `PairLaw`
-        check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every law has a cut-off
+        check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every law has a cutoff
     if not (isinstance(made, PairForces) or type(made) in FORCES):
         raise ValueError(
             f"{made!r:.80} is no force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "

@@ -151,14 +151,18 @@ class BoundForce:
             return
         array = _numbers(given)
         if array is None:
-            raise UserForceError(f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}")
+            raise UserForceError(
+                f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}"
+            )
         if array.shape != shape:
             raise UserForceError(f"the force {self.name} gave {what} of the shape {array.shape}, not {shape}")
         if not np.isfinite(array).all():
             row = int(np.argmin(np.isfinite(array).all(axis=1)))
             of = row if molecule is None else int(molecule[row])
             which = f"molecule {of + 1} ({self.system.species[self.system.model.species[of]].name})"
-            raise UserForceError(f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number")
+            raise UserForceError(
+                f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number"
+            )
         room[:] = size * array
 
     def _called(self, what: str, function: Callable, *arguments: Any) -> Any:

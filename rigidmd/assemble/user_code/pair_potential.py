@@ -85,7 +85,7 @@ class PairLaw:
             raise PairPotentialError(f"switch_start_A would do nothing with truncation = {name!r}")
         start = (given or default_switch_start(name, cutoff)) if "switch" in name else cutoff
         if not start <= cutoff:
-            raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cut-off of {cutoff:g} Å")
+            raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
         formula = self.formula(cutoff)
         kinds = _SiteTypes(self, formula, system.species)
         chosen = [np.flatnonzero([entry is not None for entry in of]) for of in kinds.of_species]
@@ -115,7 +115,7 @@ class PairLaw:
                     pairs *= 1.0 if i == j else 2.0
                     beyond = Tail(beyond[0] + pairs * part[0], beyond[1] + pairs * part[1])
                 if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
-                    raise FormulaError("it has no finite value at the cut-off")
+                    raise FormulaError("it has no finite value at the cutoff")
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
                 faults.append(f"between {kinds.words(i)} and {kinds.words(j)}: {error}")
             else:
@@ -164,12 +164,12 @@ def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | 
 
 
 def check_cutoff(cutoff: float, system: "System") -> None:
-    """Raise LawError unless the box is large enough for a law's cut-off (Å)."""
+    """Raise LawError unless the box is large enough for a law's cutoff (Å)."""
     half = min(system.space.edges) / 2
     if cutoff == inf and system.space.volume < inf:
-        raise PairPotentialError("it has no cut-off, and the box is periodic: a law in a box needs one (cutoff_A)")
+        raise PairPotentialError("it has no cutoff, and the box is periodic: a law in a box needs one (cutoff_A)")
     if not cutoff <= half:
-        raise PairPotentialError(f"its cut-off of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
+        raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
 
 
 class BoundPotential(NamedTuple):
@@ -177,7 +177,7 @@ class BoundPotential(NamedTuple):
 
     term: PairForces
     formula: Formula
-    tail: Tail | None  # what the cut-off takes away, where the scene asks for it
+    tail: Tail | None  # what the cutoff takes away, where the scene asks for it
     notes: list[str]
 
 
@@ -329,7 +329,9 @@ def pair_law(
     if (energy is None) == (table is None):
         raise ValueError("a pair law needs an energy or a table")
     if truncation is not None and truncation not in TRUNCATIONS:
-        raise ValueError(f"truncation is {truncation!r}{did_you_mean(truncation, TRUNCATIONS) or ''}; there are {', '.join(TRUNCATIONS)}")
+        raise ValueError(
+            f"truncation is {truncation!r}{did_you_mean(truncation, TRUNCATIONS) or ''}; there are {', '.join(TRUNCATIONS)}"
+        )
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")

@@ -1,4 +1,4 @@
-"""Faults of scenes of a single body: keys that this body cannot follow, or that would have no effect on it."""
+"""Errors in scenes of a single body: keys that do not apply to the body, or that would have no effect on it."""
 
 import numpy as np
 
@@ -9,18 +9,19 @@ from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.time_functions import has_constant_direction
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import axis_of_symmetry
+from rigidmd.scene.body_forces import Applied
 
 
 def body_errors(
     scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
 ) -> list[str]:
-    """Keys that this body cannot follow, or that would have no effect on it."""
+    """Messages on keys of any table that do not apply to this body, or would have no effect on it."""
     faults, body, fluid = [], scene.body, scene.fluid
-    turning, along_axes = bool(moments.any()), np.array_equal(axes, np.eye(3))
-    if not turning:
-        faults += _idle_of_points(scene)
+    rotates, along_axes = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    if not rotates:
+        faults += _rotation_keys_of_point(scene)
         if body.pinned:
-            faults.append("body: a point at the pivot has nothing to move; give it inertia or a centre_of_mass_m")
+            faults.append("body: a point at the pivot cannot move; give it inertia or a centre_of_mass_m")
         if added_mass.any():
             faults.append("fluid.added_mass_kg: a point carries no fluid along; leave it out")
         for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
@@ -30,11 +31,11 @@ def body_errors(
         for k in np.flatnonzero(moments == 0):
             if added_mass[k - 1] != added_mass[k - 2]:
                 faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
-    if turning and not along_axes:
-        faults += _needs_principal_axes(scene)
-    if (scene.wheels or scene.changing_inertia) and turning and not (moments > 0).all():
+    if rotates and not along_axes:
+        faults += _keys_of_principal_axes(scene)
+    if (scene.wheels or scene.changing_inertia) and rotates and not (moments > 0).all():
         faults.append("wheels and changing_inertia need a body with inertia about every axis")
-    if scene.output.drawn_as == "top" and turning:
+    if scene.output.drawn_as == "top" and rotates:
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
             shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
@@ -45,37 +46,33 @@ def body_errors(
     if body.pinned:
         if scene.changing_inertia is not None and centre.any():
             faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
-        if scene.gravity is not None and not centre.any() and turning:
+        if scene.gravity is not None and not centre.any() and rotates:
             faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
         faults += [
-            f"applied.{k}.force_N does nothing at the pivot; say where it acts with at_m"
+            f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
             for k, entry in enumerate(scene.applied)
             if entry.force_N is not None and not any(entry.at_m or ())
         ]
     return faults
 
 
-def _idle_of_points(scene: BodyScene) -> list[str]:
-    """Keys of rotation, which a point does not have."""
+def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
+    """Messages on keys of rotation, which a point does not have."""
     start, none = scene.start, type(scene.start)()
     named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
     idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
     idle += [key for key in ("friction", "wheels") if getattr(scene, key)]
     idle += [f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None]
     if scene.fluid is not None:
-        turning = (
-            "linear_rotational_resistance_N_m_s",
-            "quadratic_rotational_resistance_N_m_s2",
-            "added_inertia_kg_m2",
-        )
-        idle += [f"fluid.{key}" for key in turning if any(getattr(scene.fluid, key) or ())]
+        keys = ("linear_rotational_resistance_N_m_s", "quadratic_rotational_resistance_N_m_s2", "added_inertia_kg_m2")
+        idle += [f"fluid.{key}" for key in keys if any(getattr(scene.fluid, key) or ())]
     if scene.output.axis is not None:
         idle.append("output.axis")
-    return [f"{key}: the body has no inertia: a point does not turn" for key in idle]
+    return [f"{key}: the body has no inertia: a point does not rotate" for key in idle]
 
 
-def _needs_principal_axes(scene: BodyScene) -> list[str]:
-    """Keys given along the body's axes, which must be principal axes unless all three values are equal."""
+def _keys_of_principal_axes(scene: BodyScene) -> list[str]:
+    """Messages on keys along the body's axes, which must be principal axes unless all three values are equal."""
     faults = []
     for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
         for key in type(section).model_fields if section else ():
@@ -84,18 +81,18 @@ def _needs_principal_axes(scene: BodyScene) -> list[str]:
                 continue
             if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
                 faults.append(
-                    f"{name}.{key} is told along the body's axes, which are not principal axes of its inertia: "
+                    f"{name}.{key} is given along the body's axes, which are not principal axes of its inertia: "
                     "give the body in its principal axes"
                 )
     return faults
 
 
-def torque_errors(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning: bool) -> list[str]:
-    """Torques about axes without inertia."""
+def torque_errors(entry: Applied, k: int, axes: np.ndarray, moments: np.ndarray, rotates: bool) -> list[str]:
+    """Messages on torques about axes without inertia."""
     if entry.torque_N_m is None and entry.at_m is None:
         return []
-    if not turning:
-        return [f"applied.{k}: a point cannot be turned"]
+    if not rotates:
+        return [f"applied.{k}: a point has no inertia, and a torque cannot rotate it"]
     if (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
         torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
         arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
@@ -105,38 +102,36 @@ def torque_errors(entry, k: int, axes: np.ndarray, moments: np.ndarray, turning:
 
 
 def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
-    """Integrators that cannot move this body, or not to their order. has_functions : Python functions apply forces."""
+    """Messages on integrators that cannot move this body, or lose their order.
+
+    immersed : whether the fluid adds mass. has_functions : whether Python functions apply forces
+    """
     run, resistance = scene.run, resistance_of(scene)
-    braked = not isinstance(resistance, NoResistance)
+    resisted = not isinstance(resistance, NoResistance)
     if run.is_auto:
         return []
     if run.integrator in SOLVERS:
-        if braked and resistance.rotation_dry.any():
-            return [
-                f"run: dry friction jumps where a body stops, which {run.integrator} cannot step over: "
-                "use velocity_verlet"
-            ]
+        if resisted and resistance.rotation_dry.any():
+            what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
+            return [f"run: {what}: use velocity_verlet"]
         return []
     scheme = SCHEMES[run.integrator].with_rotor(run.rotor)
-    if braked and min(scheme.kicks) < 0:
-        forward = [name for name, other in SCHEMES.items() if min(other.kicks) >= 0]
-        return [
-            f"run: {run.integrator} takes steps back in time, which a resistance does not allow: use one of "
-            f"{', '.join(forward)}"
-        ]
-    if scheme.has_gradient and (braked or scene.applied or has_functions):
+    if resisted and min(scheme.kicks) < 0:
+        forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
+        return [f"run: {run.integrator} has negative substeps, which a resistance does not allow: use one of {forward}"]
+    if scheme.has_gradient and (resisted or scene.applied or has_functions):
         plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
         return [
-            f"run: {run.integrator} asks for the gradient of the forces, which resistance and applied forces do not "
-            f"have; use one of {', '.join(plain)}"
+            f"run: {run.integrator} needs the gradient of the forces, which resistance and applied forces do not have; "
+            f"use one of {', '.join(plain)}"
         ]
     frame = frame_of(scene)
-    wandering = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
+    axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
     why = {
         "wheels": scene.wheels,
         "changing_inertia": scene.changing_inertia,
         "added mass": immersed,
-        "a frame that changes its axis": wandering,
+        "a frame that changes its axis": axis_changes,
     }
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
