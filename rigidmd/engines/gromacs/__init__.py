@@ -1,1 +1,1 @@
-"""Files for GROMACS."""
+"""The export of files for GROMACS."""

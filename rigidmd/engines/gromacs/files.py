@@ -1,7 +1,7 @@
 """Input files of GROMACS for a system: coordinates, topology, settings of each stage, and a script that runs them.
 
-GROMACS keeps distances: of two points by a constraint, and of three by SETTLE, which is analytic. So there is a way for
-linear bodies and for those whose mass is in a plane, with all other sites virtual. Its units are nm, ps, u, e, kJ/mol.
+GROMACS constrains the distance of two points, or those of three by SETTLE, which is analytic. So linear molecules, and
+molecules whose mass is in a plane, are possible, with all other sites virtual. Its units are nm, ps, u, e, kJ/mol.
 """
 
 from math import inf
@@ -14,7 +14,7 @@ from scipy.special import erfc
 from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import as_word, distinct, in_comment
 from rigidmd.core.state import State
-from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
+from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
 from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.forces.ewald.pme import Pme
@@ -26,34 +26,34 @@ from rigidmd.units import KJ_PER_MOL
 
 NM = 0.1
 COORDINATES, TOPOLOGY, SCRIPT = "conf.gro", "topol.top", "run.sh"
-#: vdw-modifier by the ending.
+#: vdw-modifier by truncation.
 MODIFIERS = {"plain": "None", "shift": "Potential-shift", "force_switch": "Force-switch", "switch": "Potential-switch"}
-#: Decimals of coordinates in nm; a .gro allows any number of them.
+#: Decimals of coordinates in nm. A .gro may have any number of them.
 DECIMALS = 9
 #: Of PME in GROMACS.
 ORDERS = range(3, 13)
-#: A mass point that is no site.
+#: Atom type of a mass point without a site.
 POINT = "MP"
 SEEDS = 2**31 - 1
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """What of a scene GROMACS cannot do, in words; empty if it can do all."""
+    """Descriptions of the features of a scene that GROMACS lacks."""
     system = view.system
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
     if not view.is_periodic or system.cutoff == inf:
-        found.append("there is no box: GROMACS computes pairs within a cut-off in a periodic box")
+        found.append("no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box")
     if view.lennard_jones is not None and view.truncation not in MODIFIERS:
         found.append(f"forces.truncation = {view.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
     if view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift"):
         found.append(
-            f"forces.truncation = {view.truncation!r} with reaction_field: GROMACS' ends as plain or shift; "
-            "take one of them, or pme"
+            f"forces.truncation = {view.truncation!r} with reaction_field: GROMACS has plain and shift for it; "
+            "use one of them, or pme"
         )
     if view.electrostatics in ("ewald", "damped_shifted_force"):
         found.append(f"forces.electrostatics = {view.electrostatics!r}: GROMACS has pme and reaction_field")
     if view.frozen.any():
-        found.append("frozen molecules: GROMACS would let them act on one another")
+        found.append("frozen molecules: GROMACS would compute forces between them")
     shapes = [_body(m) for m in system.species]
     found += [
         f"{m.name}: GROMACS has no rigid bodies of this shape, whose mass is neither on a line nor in a plane"
@@ -61,30 +61,25 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
         if len(body.mass) > 3
     ]
     if sum(len(body.mass) == 3 for body in shapes) > 1:
-        found.append("several kinds of planar molecules: GROMACS' SETTLE keeps one kind of triangle")
+        found.append("several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle")
     for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
+        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
     return found
 
 
 def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
-    found, kind = [], stage.thermostat_kind
+    found = common_stage_limits(stage, "GROMACS", "molecules", "GROMACS rotates molecules by constrained distances")
+    kind = stage.thermostat_kind
     if kind == "andersen":
-        found.append("thermostat = 'andersen': GROMACS has none that gives whole molecules new velocities")
-    if stage.integrator not in (("velocity_verlet", "baoab") if kind == "langevin" else ("velocity_verlet",)):
-        found.append(f"integrator = {stage.integrator!r}: GROMACS moves molecules by velocity_verlet")
-    if kind == "langevin" and len(set(stage.frictions)) > 1:
-        found.append("friction_rotation_per_ps: GROMACS has one friction for translation and rotation")
-    if stage.rotor == "exact":
-        found.append("rotor = 'exact': GROMACS turns molecules by keeping distances")
+        found.append("thermostat = 'andersen': GROMACS' Andersen thermostat does not act on whole molecules")
     if stage.ensemble == "nph":
-        found.append("ensemble = 'nph': of GROMACS only npt is written")
+        found.append("ensemble = 'nph': the export to GROMACS has only npt")
     if stage.barostat_kind == "monte_carlo":
         found.append("barostat = 'monte_carlo': GROMACS has cell_rescaling")
     if stage.has_barostat and kind == "nose_hoover":
-        found.append("thermostat = 'nose_hoover' with a barostat: GROMACS' cell_rescaling is without velocity Verlet")
+        found.append("thermostat = 'nose_hoover' with a barostat: GROMACS has no cell_rescaling with velocity Verlet")
     if stage.has_barostat and stage.pressure_coupling not in ("isotropic", "semi_isotropic"):
         found.append(f"pressure_coupling = {stage.pressure_coupling!r}: GROMACS' cell_rescaling has isotropic")
     if stage.has_barostat and stage.pressures[0] != stage.pressures[1]:
@@ -93,8 +88,8 @@ def _unsupported_in_stage(stage: Stage) -> list[str]:
 
 
 def _body(molecule: Molecule) -> MassPoints:
-    """The mass points of a molecule; of three, the first is the top of an isosceles triangle and they follow on one
-    another, as SETTLE has it."""
+    """The mass points of a molecule. Three points are adjacent, and the first is the apex of an isosceles triangle, as
+    SETTLE needs it."""
     body = mass_points(molecule)
     if len(body.mass) != 3 or (body.site < 0).all():
         return body
@@ -104,7 +99,7 @@ def _body(molecule: Molecule) -> MassPoints:
 
 
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the files for a system that begins at a state; their names. Raises OutputError."""
+    """Write the files for a system that begins at a state, and return their names. Raises OutputError."""
     bodies = [_body(m) for m in view.system.species]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
@@ -124,16 +119,15 @@ def _script(names: list[str]) -> str:
     lines = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
     before = f"-c {COORDINATES}"
     for name in names:
-        lines += [
-            f"gmx grompp -f {quote(name)}.mdp {before} -p {TOPOLOGY} -po {quote(name)}_all.mdp -o {quote(name)}.tpr"
-        ]
-        lines += [f'gmx mdrun -deffnm {quote(name)} "$@"']
-        before = f"-c {quote(name)}.gro -t {quote(name)}.cpt"
+        name = quote(name)
+        lines += [f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"]
+        lines += [f'gmx mdrun -deffnm {name} "$@"']
+        before = f"-c {name}.gro -t {name}.cpt"
     return "\n".join(lines) + "\n"
 
 
 def _extra(molecule: Molecule, body: MassPoints) -> int:
-    """Mass points of a molecule that are no sites; they come after its sites."""
+    """Number of mass points of a molecule without a site. They come after its sites."""
     return int((body.site < 0).sum())
 
 
@@ -154,17 +148,16 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         m = system.species[k]
         count, added = len(m.masses), _extra(m, bodies[k])
         names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
-        place = np.concatenate([at[s : s + count], more[e : e + added]])
-        speed = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
-        for name, x, v in zip(names, place, speed, strict=True):
+        positions = np.concatenate([at[s : s + count], more[e : e + added]])
+        velocities = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
+        for name, x, v in zip(names, positions, velocities, strict=True):
             head = f"{(n + 1) % 100000:5d}{as_word(m.residue_names[0]):<5}{name:>5}{(len(rows) + 1) % 100000:5d}"
             where = "".join(f"{value * NM:{width}.{DECIMALS}f}" for value in x)
             rows.append(head + where + "".join(f"{value * NM:{width}.{DECIMALS + 1}f}" for value in v))
         s, e = s + count, e + added
     a, b, c = state.cell * NM
-    box = [a[0], b[1], c[2]] + (
-        [a[1], a[2], b[0], b[2], c[0], c[1]] if state.cell[np.tril_indices(3, -1)].any() else []
-    )
+    is_tilted = state.cell[np.tril_indices(3, -1)].any()
+    box = [a[0], b[1], c[2]] + ([a[1], a[2], b[0], b[2], c[0], c[1]] if is_tilted else [])
     last = " ".join(f"{value:.{DECIMALS}f}" for value in box)
     return "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
 
@@ -178,14 +171,9 @@ def _points_at(view: ForceFieldView, points: Points, state: State) -> tuple[np.n
 def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     """The .top file: kinds of sites, all parameters between them, molecules."""
     system, kinds = view.system, view.kinds
-    lines = [
-        f"; {in_comment(system.scene.in_short)}",
-        "; Written by rigidmd.",
-        "",
-        "[ defaults ]",
-        "; nbfunc comb-rule gen-pairs",
-    ]
-    lines += ["1 2 no", "", "[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
+    lines = [f"; {in_comment(system.scene.in_short)}", "; Written by rigidmd.", ""]
+    lines += ["[ defaults ]", "; nbfunc comb-rule gen-pairs", "1 2 no", ""]
+    lines += ["[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
     rows = [(view.sigma[k, k] * NM, view.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
     lines += [
         f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {in_comment(kind.name)}"
@@ -203,8 +191,8 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     for k in sorted(set(index.tolist())):
         first = int(np.flatnonzero(index == k)[0])
         start = int(np.searchsorted(system.sites.molecule, first))
-        own = view.kind[start : start + len(system.species[k].masses)]
-        lines += ["", *_molecule(view, system.species[k], bodies[k], own, names[k])]
+        kind = view.kind[start : start + len(system.species[k].masses)]
+        lines += ["", *_molecule(view, system.species[k], bodies[k], kind, names[k])]
     lines += ["", "[ system ]", f"{system.scene.name}", "", "[ molecules ]"]
     ends = np.flatnonzero(np.diff(index, append=-1)) + 1
     for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
@@ -221,7 +209,6 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
     mass[where] = body.mass
     types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
     names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
-    residue = as_word(m.residue_names[0])
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     residue = as_word(m.residue_names[0])
     lines += [
@@ -237,10 +224,10 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
     if body.virtual_sites:
         lines += ["", f"[ virtual_sites{len(at)} ]"]
     points = " ".join(map(str, at))
-    for site, place in body.virtual_sites.items():
-        parts = " ".join(f"{weight:.12g}" for weight in place.weight[1:])
-        out = f"4 {parts} {place.cross / NM:.12g}" if place.cross else f"1 {parts}"
-        lines.append(f"{site + 1} {points} {out}")
+    for k, site in body.virtual_sites.items():
+        weights = " ".join(f"{weight:.12g}" for weight in site.weight[1:])
+        out = f"4 {weights} {site.cross / NM:.12g}" if site.cross else f"1 {weights}"
+        lines.append(f"{k + 1} {points} {out}")
     if len(mass) > 1:
         lines += ["", "[ exclusions ]"]
         lines += [" ".join(str(j + 1) for j in [i, *range(i + 1, len(mass))]) for i in range(len(mass) - 1)]
@@ -285,11 +272,11 @@ def _settings(view: ForceFieldView, k: int) -> str:
         found["vdw-modifier"] = MODIFIERS[view.truncation]
         if "switch" in view.truncation:
             found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
-    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(view) | _bath(stage)).items())
+    return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(view) | _couplings(stage)).items())
 
 
 def _integrator(stage: Stage) -> str:
-    """Velocity Verlet, unless a thermostat or barostat of GROMACS is without it."""
+    """Velocity Verlet, unless GROMACS lacks the thermostat or the barostat for it."""
     if stage.thermostat_kind == "langevin":
         return "sd"
     return "md" if stage.thermostat_kind == "velocity_rescaling" else "md-vv"
@@ -311,7 +298,7 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
     return {"coulombtype": "Cut-off"}
 
 
-def _bath(stage: Stage) -> dict[str, object]:
+def _couplings(stage: Stage) -> dict[str, object]:
     """Thermostat and barostat."""
     found: dict[str, object] = {"tcoupl": "no", "pcoupl": "no"}
     if not stage.has_thermostat:

@@ -1,4 +1,4 @@
-"""Binary dumps of LAMMPS (`dump custom` to a file that ends in .bin), as it writes them since 2020."""
+"""Reader of LAMMPS' binary dumps (`dump custom` to a file with extension .bin), in the format since 2020."""
 
 import struct
 from pathlib import Path
@@ -8,13 +8,10 @@ import numpy as np
 
 from rigidmd.errors import EngineError
 
-#: Of a dump custom.
 MAGIC = b"DUMPCUSTOM"
 
 
 class Dump(NamedTuple):
-    """One frame."""
-
     step: int
     low: np.ndarray  # (3,) of the box, Å
     cell: np.ndarray  # (3, 3) rows a, b, c
@@ -35,7 +32,7 @@ def read_dump(path: Path) -> Dump:
     try:
         (mark,) = take("q")  # below zero: the length of the name that follows
         if take(f"{max(-mark, 0)}s") != (MAGIC,):
-            raise ValueError("it is no dump custom")
+            raise ValueError("not a file of `dump custom`")
         take("ii")  # byte order, revision
         step, _, slanted = take("qqi")
         take("6i")  # kinds of boundaries
@@ -62,7 +59,7 @@ def read_dump(path: Path) -> Dump:
 
 
 def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: float) -> tuple[np.ndarray, np.ndarray]:
-    """The origin (3,) and the cell (3, 3) of a dump, whose bounds are those of the smallest upright box around it."""
+    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box."""
     low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
     high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
     cell = np.diag(high - low)

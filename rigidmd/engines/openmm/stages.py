@@ -4,15 +4,7 @@ from math import pi
 from typing import Any
 
 from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.openmm.system import (
-    COULOMB_PAIRS,
-    LENNARD_JONES,
-    RECIPROCAL,
-    STEP_COULOMB,
-    STEP_LENNARD_JONES,
-    TAIL,
-    library,
-)
+from rigidmd.engines.openmm.system import Group, library
 from rigidmd.scene.stage import Stage
 
 #: Variables of the velocity Verlet integrator: fraction of a kick, and whether positions move.
@@ -85,10 +77,10 @@ def step(integrator: Any, steps: int) -> None:
 
 def integration_groups(view: ForceFieldView, stage: Stage) -> set[int]:
     """The force groups that move a stage: those with forces, and energies that a barostat needs in addition."""
-    groups = {LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL}
+    groups = {Group.LENNARD_JONES, Group.COULOMB_PAIRS, Group.RECIPROCAL}
     if stage.has_barostat:
         # it compares energies; the pressure agrees with the forces if energies are continuous
-        groups |= {STEP_LENNARD_JONES, STEP_COULOMB, TAIL}
+        groups |= {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB, Group.TAIL}
     return groups
 
 

@@ -1,7 +1,7 @@
-"""A system in OpenMM's terms: particles, kept distances, virtual sites, and forces, each in a group of its own.
+"""A system as an `openmm.System`: particles, constraints, virtual sites, and forces in separate groups.
 
-OpenMM knows no rigid bodies. Mass points joined by kept distances stand for them (`mass_points`), and all other sites
-are virtual. Its units are nm, ps, u, e and kJ/mol.
+OpenMM has no rigid bodies. Mass points with constrained distances represent them (`mass_points`), and all other sites
+are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
 """
 
 import re
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erfc
 
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
-from rigidmd.engines.force_field import ForceFieldView, unsupported_terms
+from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
 from rigidmd.engines.mass_points import MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points
 from rigidmd.engines.system import charges_in
@@ -30,58 +30,62 @@ from rigidmd.units import COULOMB, KJ_PER_MOL
 if TYPE_CHECKING:
     import openmm
 
-#: nm in an Å.
+#: nm per Å.
 NM = 0.1
-#: Relative differences of parameters that are rounding.
+#: Relative difference of equal parameters.
 ROUNDING = 1e-12
-#: Of OpenMM's splines.
+#: Order of OpenMM's splines.
 PME_ORDER = 5
-#: Of one system, the groups of its forces. A step is what the energies of pairs jump by at the cut-off, taken off: it
-#: exerts no force, and with it energies are continuous. The tail is that of the tail correction.
-LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL, STEP_LENNARD_JONES, STEP_COULOMB, TAIL = range(6)
+
+
+class Group:
+    """Force groups of a system. A step group subtracts the jump of the pair energies at the cutoff: it exerts no force,
+    and energies with it are continuous. TAIL is the tail correction."""
+
+    LENNARD_JONES, COULOMB_PAIRS, RECIPROCAL, STEP_LENNARD_JONES, STEP_COULOMB, TAIL = range(6)
 
 
 def library() -> Any:
-    """OpenMM. Raises EngineError with what to install."""
+    """The module openmm. Raises EngineError if it is not installed."""
     try:
         import openmm
     except ImportError:
-        raise EngineError("OpenMM is not here: pip install 'rigidmd[openmm]' brings it") from None
+        raise EngineError("OpenMM is not installed: pip install 'rigidmd[openmm]' installs it") from None
     return openmm
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """What of a scene OpenMM cannot do, in words; empty if it can do all."""
+    """Descriptions of the features of a scene that OpenMM lacks."""
     system, forces = view.system, view.system.scene.forces
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
     if view.has_ewald_sum and grid_for(view, PME_ORDER) is None:
         found.append(
             f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, "
-            "has the accuracy asked for; ask for less"
+            "reaches the requested accuracy; request a lower one"
         )
     for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{fault}" for fault in _unsupported_in_stage(stage)]
+        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
     if view.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
         found.append("a barostat with frozen molecules: OpenMM would move them with the box")
     return found
 
 
 def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
-    """A grid for splines of an order with the accuracy of the scene's Ewald sum; None if there is none.
+    """A grid for splines of an order with the accuracy of the scene's Ewald sum; None if no grid reaches it.
 
-    The scene's own grid if its splines are of that order or a lower one.
+    It is the grid of the scene if the order of its splines is not higher.
     """
     system, law = view.system, view.coulomb
-    own = system.terms.get("coulomb_reciprocal")
-    if isinstance(own, Pme) and own.order <= order:
-        a, b, c = own.grid
+    pme = system.terms.get("coulomb_reciprocal")
+    if isinstance(pme, Pme) and pme.order <= order:
+        a, b, c = pme.grid
         return a, b, c
     if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
         return None
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charges = charges_in(system.species, counts)
-    beyond = real_error(charges, law.alpha, law.cutoff, system.space.volume)
-    error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - beyond**2, 0.0))
+    real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
+    error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
     found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
     return None if found is None else found[0]
 
@@ -89,17 +93,10 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
 def _unsupported_in_stage(stage: Stage) -> list[str]:
     if stage.is_minimisation:
         return []  # rigidmd itself minimises
-    found, allowed, kind = [], ("velocity_verlet",), stage.thermostat_kind
+    found = common_stage_limits(stage, "OpenMM", "molecules", "OpenMM rotates molecules by constrained distances")
+    kind = stage.thermostat_kind
     if stage.has_thermostat and kind not in ("nose_hoover", "langevin"):
-        found.append(f"thermostat = {kind!r}: OpenMM has nose_hoover and langevin for molecules with kept distances")
-    if kind == "langevin":
-        allowed = ("velocity_verlet", "baoab")
-        if len(set(stage.frictions)) > 1:
-            found.append("friction_rotation_per_ps: OpenMM has one friction for translation and rotation")
-    if stage.integrator not in allowed:
-        found.append(f"integrator = {stage.integrator!r}: OpenMM moves molecules by velocity_verlet")
-    if stage.rotor == "exact":
-        found.append("rotor = 'exact': OpenMM turns molecules by keeping distances")
+        found.append(f"thermostat = {kind!r}: OpenMM has nose_hoover and langevin for constrained molecules")
     if stage.ensemble == "nph":
         found.append("ensemble = 'nph': OpenMM has no barostat without a thermostat")
     if stage.barostat_kind == "cell_rescaling":
@@ -112,44 +109,38 @@ def _unsupported_in_stage(stage: Stage) -> list[str]:
 class Layout(NamedTuple):
     """The particles of a system: sites and mass points, molecule by molecule. q particles, p mass points, s sites."""
 
-    mass: np.ndarray  # (q,) u; 0 for what is placed or frozen
+    mass: np.ndarray  # (q,) u; 0 for virtual sites and frozen particles
     molecule: np.ndarray  # (q,)
     site: np.ndarray  # (s,) particle of each site
     point: np.ndarray  # (p,) particle of each mass point
     points: Points
     of_species: list[MassPoints]
     first: np.ndarray  # (n,) first particle of each molecule
-    local: list[np.ndarray]  # for each species the particles of its points, from the first one of the molecule
+    local: list[np.ndarray]  # for each species the particles of its mass points, counted from `first`
 
     def excluded(self, view: ForceFieldView) -> list[tuple[int, int]]:
-        """Pairs of particles that do not act on one another: those of one molecule, and of frozen ones."""
-        count = np.diff([*self.first, len(self.mass)])
-        pairs = [
-            (int(a) + i, int(a) + j)
-            for a, n in zip(self.first, count, strict=True)
-            for i in range(n)
-            for j in range(i + 1, n)
-        ]
-        still = np.flatnonzero(view.frozen[self.molecule])
-        other = np.triu_indices(len(still), 1)
-        apart = self.molecule[still[other[0]]] != self.molecule[still[other[1]]]
-        return pairs + list(zip(still[other[0]][apart].tolist(), still[other[1]][apart].tolist(), strict=True))
+        """Pairs of particles that do not interact: within a molecule, and between frozen molecules."""
+        pairs = []
+        for a, n in zip(self.first, np.diff([*self.first, len(self.mass)]), strict=True):
+            pairs += [(int(a) + i, int(a) + j) for i in range(n) for j in range(i + 1, n)]
+        frozen = np.flatnonzero(view.frozen[self.molecule])
+        one, other = (frozen[index] for index in np.triu_indices(len(frozen), 1))
+        between = self.molecule[one] != self.molecule[other]
+        return pairs + list(zip(one[between].tolist(), other[between].tolist(), strict=True))
 
 
 def layout(view: ForceFieldView) -> Layout:
-    """The particles that stand for the molecules of a system: of each its sites, in their order, then other points."""
+    """The particles that represent a system: for each molecule its sites, in order, then its other mass points."""
     system = view.system
     species, frozen = system.model.species, system.model.inverse_mass == 0
-    bodies = [mass_points(m, bool(still)) for m, still in zip(system.species, frozen, strict=True)]
+    bodies = [mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)]
     local, mass = [], []
-    for m, body, still in zip(system.species, bodies, frozen, strict=True):
+    for m, body, is_frozen in zip(system.species, bodies, frozen, strict=True):
         extra = np.cumsum(body.site < 0) - 1
-        where = np.where(body.site >= 0, body.site, len(m.masses) + extra)
-        own = np.zeros(len(m.masses) + int((body.site < 0).sum()))
-        own[where] = 0.0 if still else body.mass
-        local.append(where)
-        mass.append(own)
-    count = np.array([len(own) for own in mass])[species]
+        local.append(np.where(body.site >= 0, body.site, len(m.masses) + extra))
+        mass.append(np.zeros(len(m.masses) + int((body.site < 0).sum())))
+        mass[-1][local[-1]] = 0.0 if is_frozen else body.mass
+    count = np.array([len(of_species) for of_species in mass])[species]
     first = np.cumsum(count) - count
     sites = system.sites_per_molecule
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
@@ -170,11 +161,11 @@ def layout(view: ForceFieldView) -> Layout:
     )
 
 
-def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, apart: bool) -> "openmm.System":
-    """OpenMM's System, with all forces but a barostat; cell (3, 3) is that of the state it begins with.
+def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
+    """The `openmm.System` with all forces except a barostat, and the initial cell (3, 3).
 
-    apart : whether Lennard-Jones and Coulomb forces are two forces even where one can do both, which is faster: a step
-        of 512 waters with PME takes 8 ms in place of 11 on two cores
+    separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have both, which is faster: a
+        step of 512 waters with PME takes 8 ms instead of 11 on two cores
     """
     mm = library()
     made = mm.System()
@@ -188,13 +179,13 @@ def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, apa
             continue
         for i, j, distance in body.distances:
             made.addConstraint(where[i], where[j], distance * NM)
-        for site, place in body.virtual_sites.items():
-            made.setVirtualSite(int(a) + site, _openmm_virtual_site(mm, where, place.weight.tolist(), place.cross))
+        for k, site in body.virtual_sites.items():
+            made.setVirtualSite(int(a) + k, _openmm_virtual_site(mm, where, site.weight.tolist(), site.cross))
     excluded = particles.excluded(view)
-    for force, group in _forces(mm, view, particles, apart):
+    for force, group in _forces(mm, view, particles, separate):
         force.setForceGroup(group)
         add = force.addException if isinstance(force, mm.NonbondedForce) else None
-        for i, j in excluded if group != TAIL else []:
+        for i, j in excluded if group != Group.TAIL else []:
             if add is None:
                 force.addExclusion(i, j)
             else:
@@ -211,46 +202,46 @@ def _openmm_virtual_site(mm: Any, points: list[int], weight: list[float], cross:
         return mm.OutOfPlaneSite(*points, weight[1], weight[2], cross / NM)
     if len(points) == 3:
         return mm.ThreeParticleAverageSite(*points, *weight)
-    # at the origin of local axes, which is an average of any number of particles; the axes do not matter
+    # the origin of local axes is an average of any number of particles; the axes do not matter
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(mm: Any, view: ForceFieldView, particles: Layout, apart: bool) -> list[tuple]:
-    """Forces and their groups."""
+def _forces(mm: Any, view: ForceFieldView, particles: Layout, separate: bool) -> list[tuple]:
+    """Pairs of a force and its group."""
     found, law, coulomb = [], view.lennard_jones, view.coulomb
     plain = _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
-    together = plain is not None and has_charge_force and not apart
+    together = plain is not None and has_charge_force and not separate
     if law is not None and view.epsilon.any():
         if plain is None:
-            found.append((_custom_lennard_jones(mm, view, particles), LENNARD_JONES))
+            found.append((_custom_lennard_jones(mm, view, particles), Group.LENNARD_JONES))
         elif not together:
             force = _nonbonded(mm, view, particles, law.cutoff, np.zeros_like(view.charge), plain)
-            found.append((force, LENNARD_JONES))
+            found.append((force, Group.LENNARD_JONES))
         if view.is_periodic and isinstance(law.truncation, Unmodified) and view.truncation == "plain":
-            found.append((_custom_lennard_jones(mm, view, particles, step=True), STEP_LENNARD_JONES))
+            found.append((_custom_lennard_jones(mm, view, particles, step=True), Group.STEP_LENNARD_JONES))
     if coulomb is not None and has_charge_force:
         force = _nonbonded(mm, view, particles, coulomb.cutoff, view.charge, plain if together else None)
-        found.append((force, COULOMB_PAIRS))
+        found.append((force, Group.COULOMB_PAIRS))
         if isinstance(coulomb, ScreenedCoulomb):
             force.setNonbondedMethod(mm.NonbondedForce.PME)
             force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(view, PME_ORDER) or ()))
-            force.setReciprocalSpaceForceGroup(RECIPROCAL)
+            force.setReciprocalSpaceForceGroup(Group.RECIPROCAL)
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
-            found.append((_custom_coulomb(mm, view, particles, height), STEP_COULOMB))
+            found.append((_custom_coulomb(mm, view, particles, height), Group.STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append((_custom_coulomb(mm, view, particles, coulomb_formula(coulomb, 1.0)), COULOMB_PAIRS))
+        found.append((_custom_coulomb(mm, view, particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS))
         if view.is_periodic and not isinstance(coulomb, DampedShiftedForce) and view.truncation == "plain":
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
-            found.append((_custom_coulomb(mm, view, particles, height), STEP_COULOMB))
+            found.append((_custom_coulomb(mm, view, particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
         energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
-        found.append((mm.CustomVolumeForce(f"{energy!r}/v"), TAIL))
+        found.append((mm.CustomVolumeForce(f"{energy!r}/v"), Group.TAIL))
     return found
 
 
 def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
-    """sigma and epsilon of kinds where OpenMM's own law is that of the scene; None where it is not."""
+    """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in, else None."""
     law = view.lennard_jones
     if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
@@ -258,7 +249,7 @@ def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray
 
 
 def _lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
-    """sigma and epsilon of kinds if those between kinds follow from them, else None."""
+    """sigma and epsilon of kinds if all pairs follow from them by Lorentz-Berthelot rules, else None."""
     sigma, epsilon = view.sigma.diagonal(), view.epsilon.diagonal()
     deep = view.epsilon > 0
     same = np.allclose(view.epsilon, np.sqrt(np.outer(epsilon, epsilon)), rtol=ROUNDING, atol=0)
@@ -304,7 +295,7 @@ def _method(kind, view: ForceFieldView, cutoff: float) -> int:
 def _custom(
     mm: Any, view: ForceFieldView, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]
 ):
-    """A CustomNonbondedForce of a formula of r in Å, with values (s,) of sites."""
+    """A CustomNonbondedForce with a formula of r in Å, and values (s,) of sites."""
     text = re.sub(r"\br\b", "R", formula)
     force = mm.CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
     force.setNonbondedMethod(_method(mm.CustomNonbondedForce, view, cutoff))
@@ -320,18 +311,18 @@ def _custom(
 
 
 def _custom_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
-    """The law as a formula, or the step that it makes at the cut-off; linear in c12 and c6, which tables of kinds give.
+    """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6, from tables of kinds.
 
-    Kind 0 of the tables is that of points that are no sites.
+    Kind 0 of the tables is for mass points without a site.
     """
     law = view.lennard_jones
     assert isinstance(law, LennardJones)
     if step:
         formula = f"c6*{law.cutoff**-6!r}-c12*{law.cutoff**-12!r}"
     else:
-        parts = [lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0))]
-        definitions = f";{parts[0][1]}" if len(parts[0]) == 2 else ""
-        formula = f"c12*({parts[0][0]})+c6*({parts[1][0]}){definitions}"
+        of12, of6 = (lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0)))
+        definitions = f";{of12[1]}" if len(of12) == 2 else ""
+        formula = f"c12*({of12[0]})+c6*({of6[0]}){definitions}"
     six = view.sigma**6
     c6 = 4 * view.epsilon * six / KJ_PER_MOL
     force = _custom(
@@ -347,7 +338,7 @@ def _custom_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step
 
 
 def _custom_coulomb(mm: Any, view: ForceFieldView, particles: Layout, formula: str):
-    """q q times a formula of unit strength; charges are in units where q q/r is in kJ/mol."""
+    """q q times a formula of unit strength. Charges are in units in which q q/r is in kJ/mol."""
     law = view.coulomb
     assert law is not None
     main, *definitions = formula.split(";", 1)
