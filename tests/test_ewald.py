@@ -323,7 +323,7 @@ def test_nist_spce_in_a_monoclinic_cell_that_leans_by_half_an_edge(reference, tm
     scene = nist_scene(file, cell, tmp_path, box, ewald_alpha_per_A=0.285, ewald_k_max=7, ewald_k_radius_per_A=radius)
     simulation = Simulation(scene)
     found = simulation.start_energy(BOLTZMANN, "K")
-    assert any("1884 waves" in note for note in found["notes"])
+    assert any("1884 k-vectors" in note for note in found["notes"])
     assert set(found["components"]) == set(MONOCLINIC)
     for name, printed in MONOCLINIC.items():
         assert found["components"][name] == published(printed), name

@@ -6,8 +6,14 @@ import numpy as np
 
 from rigidmd.assemble.body_errors import body_errors, integrator_errors, torque_errors
 from rigidmd.assemble.body_parts import (
-    carried_fluid, frame_of, inertia_of, principal, resistance_of, rotor_of, terms_of,
-)  # fmt: skip
+    carried_fluid,
+    frame_of,
+    inertia_of,
+    principal,
+    resistance_of,
+    rotor_of,
+    terms_of,
+)
 from rigidmd.assemble.defaults import body_with_defaults
 from rigidmd.assemble.memory_check import check_memory_of_samples
 from rigidmd.core.state import State, state_of

@@ -29,7 +29,7 @@ ROUNDING = 1e-13
 
 
 def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Mass, inertia tensor about the centre of mass or pivot, centre of mass from there, points to draw, their names."""
+    """Mass, inertia tensor about the centre of mass or pivot, its position, points to draw, names of the points."""
     body = scene.body
     centre = np.array(body.centre_of_mass_m or (0.0, 0.0, 0.0))
     mass = body.mass_kg or 0.0  # with points: their sum, below

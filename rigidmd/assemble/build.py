@@ -130,10 +130,6 @@ def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Mo
     rotor = split_rotor(inertia)
     mass = np.array([m.mass for m in species])
     return Model(
-        index.astype(np.int32),
-        mass,
-        np.where(frozen, 0.0, 1 / mass),
-        inertia,
-        rotor.inverse_inertia,
+        index.astype(np.int32), mass, np.where(frozen, 0.0, 1 / mass), inertia, rotor.inverse_inertia,
         rotor if inertia.any() else NoRotor(),
-    )
+    )  # fmt: skip

@@ -1,8 +1,8 @@
 """The defaults of scenes. A system is built from a resolved scene, in which every default is filled in.
 
-A resolved scene runs to the same bits as the original scene. Three values stay open in it: an integrator "auto", which a
-pilot run chooses; the number of threads, on which results do not depend; and the grid of PME where another cell of the
-same lattice replaces a cell with a large tilt (see `SceneWithDefaults.pme_grid`).
+A resolved scene runs to the same bits as the original scene. Three values stay open in it: an integrator "auto", which
+a pilot run chooses; the number of threads, on which results do not depend; and the grid of PME where another cell of
+the same lattice replaces a cell with a large tilt (see `SceneWithDefaults.pme_grid`).
 """
 
 from math import inf, pi, prod, sqrt
@@ -209,7 +209,8 @@ def _electrostatic_faults(forces: Forces, space: Space, cutoff: float) -> list[s
     if (key := screening.get(method)) and (getattr(forces, key) or 0.0) * cutoff > MAX_ALPHA_CUTOFF:
         return [
             f"forces.{key} = {getattr(forces, key):g} with a cutoff of {cutoff:g} Å screens charges there by "
-            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {MAX_ALPHA_CUTOFF / cutoff:.3g} is of use"
+            f"erfc({getattr(forces, key) * cutoff:.3g}), far below rounding; at most {MAX_ALPHA_CUTOFF / cutoff:.3g} "
+            "is of use"
         ]
     return []
 
@@ -251,9 +252,9 @@ def _ewald(
     grid, order, cell = forces.pme_grid, forces.pme_order, cell_of(composition.space)
     if grid is not None and len(set(grid)) > 1 and not composition.has_given_cell:
         fault = (
-            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the equivalent "
-            f"cell with {edges_in_words(cell)}, {basis_in_words(composition.basis)}. Give this cell as the box, or three equal "
-            "numbers, or leave pme_grid out"
+            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the "
+            f"equivalent cell with {edges_in_words(cell)}, {basis_in_words(composition.basis)}. Give this cell as the "
+            "box, or three equal numbers, or leave pme_grid out"
         )
         return numbers, [fault], None
     if grid is None and (longest := np.linalg.norm(cell, axis=1).max()) > MAX_GRID_POINTS * SPACINGS[0]:

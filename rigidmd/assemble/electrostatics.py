@@ -144,14 +144,9 @@ def _ewald_errors(
 
 
 def _ewald(
-    scene: MolecularScene,
-    charged: ChargedSites,
-    space: Space,
-    between_pairs: Callable[[NamedTuple], NamedTuple],
-    state: State,
-    basis: np.ndarray,
-    grid: Grid | None,
-) -> Interactions:
+    scene: MolecularScene, charged: ChargedSites, space: Space, between_pairs: Callable[[NamedTuple], NamedTuple],
+    state: State, basis: np.ndarray, grid: Grid | None,
+) -> Interactions:  # fmt: skip
     forces, found = scene.forces, _ewald_errors(scene, charged, space, basis, grid)
     alpha, cutoff = not_none(forces.ewald_alpha_per_A), not_none(forces.cutoff_A)
     charge = charged.charge_e * COULOMB_CHARGE
@@ -212,14 +207,9 @@ def _ewald(
 
 
 def _frozen_correction(
-    charged: ChargedSites,
-    charge: np.ndarray,
-    space: Space,
-    alpha: float,
-    vectors: k_vectors.KVectors,
-    permittivity: float,
-    state: State,
-) -> tuple[float, float]:
+    charged: ChargedSites, charge: np.ndarray, space: Space, alpha: float, vectors: k_vectors.KVectors,
+    permittivity: float, state: State,
+) -> tuple[float, float]:  # fmt: skip
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images.
 
     charge (s,) : 0 for sites that move

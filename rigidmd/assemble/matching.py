@@ -217,15 +217,9 @@ def _match_groups(
         alike.setdefault(key, []).append(number)
     n = len(runs)
     found = MatchedMolecules(
-        species=np.full(n, -1),
-        atoms=[np.zeros(0, int)] * n,
-        centre=np.zeros((n, 3)),
-        rotation=np.zeros((n, 3, 3)),
-        deviation=np.zeros(n),
-        square=np.zeros(n),
-        massless=Counter(),
-        notes=[],
-    )
+        species=np.full(n, -1), atoms=[np.zeros(0, int)] * n, centre=np.zeros((n, 3)), rotation=np.zeros((n, 3, 3)),
+        deviation=np.zeros(n), square=np.zeros(n), massless=Counter(), notes=[],
+    )  # fmt: skip
     faults = {}
     for (residue, names, run_kinds), members in alike.items():
         called = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]

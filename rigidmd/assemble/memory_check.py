@@ -54,7 +54,8 @@ def check_memory(system: "System") -> None:
     except MemoryError as error:  # NumPy's says which array the system refused
         shape, dtype = getattr(error, "shape", ()), getattr(error, "dtype", np.uint8)
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
-        fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {format_gigabytes(free_memory())} free"
+        free = format_gigabytes(free_memory())
+        fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {free} free"
         raise SceneError(system.scene.source, [f"not enough memory: {fault}: {ADVICE}"]) from None
     kept, count = bytes_of_samples(system), observation_count(system, system.scene.output.log_interval_ps)
     if fault := memory_shortage(kept, f"a run with {count:.3g} lines in its log"):

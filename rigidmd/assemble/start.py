@@ -31,17 +31,9 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
             raise SceneError(scene.source, [f"box: {fault}"])
         try:
             found = read_structure(
-                path,
-                species,
-                scene.box.cell,
-                scene.box.periodic,
-                start.tolerance,
-                start.frame,
-                start.repeat,
-                start.atom_types,
-                None if scene.topology is None else scene.path(scene.topology),
-                held,
-            )
+                path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat,
+                start.atom_types, None if scene.topology is None else scene.path(scene.topology), held,
+            )  # fmt: skip
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
         faults = []
@@ -68,14 +60,10 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
     n = sum(counts)
     found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
-        position=start_lattice(scene, species, n, np.diag(cell), rng),
-        rotation=random_rotations(rng, n),
-        velocity=None,
-        angular_momentum_body=None,
-        cell=cell if scene.box.periodic else None,
-        residual_rms=0.0,
+        position=start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),
+        velocity=None, angular_momentum_body=None, cell=cell if scene.box.periodic else None, residual_rms=0.0,
         residual_max=0.0,
-    )
+    )  # fmt: skip
     return with_reduced_cell(found, "its", may_turn=False)
 
 

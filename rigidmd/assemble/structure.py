@@ -55,17 +55,10 @@ class Configuration(NamedTuple):
 
 
 def read_structure(
-    path: Path,
-    species: list[Molecule],
-    wanted: np.ndarray | None,
-    periodic: bool,
-    tolerance: float,
-    frame: int | None = None,
-    repeat: tuple[int, int, int] = (1, 1, 1),
-    atom_types: dict[str, str] | None = None,
-    topology: Path | None = None,
-    held: bytes | None = None,
-) -> Configuration:
+    path: Path, species: list[Molecule], wanted: np.ndarray | None, periodic: bool, tolerance: float,
+    frame: int | None = None, repeat: tuple[int, int, int] = (1, 1, 1), atom_types: dict[str, str] | None = None,
+    topology: Path | None = None, held: bytes | None = None,
+) -> Configuration:  # fmt: skip
     """The molecules of a structure file. Raises StructureError.
 
     wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types,
@@ -117,13 +110,10 @@ def with_reduced_cell(found: Configuration, whose: str, may_turn: bool) -> Confi
     if np.array_equal(turn, np.eye(3)):
         return found._replace(cell=cell, notes=(*found.notes, told), basis=basis)
     return found._replace(
-        cell=cell,
-        position=found.position @ turn.T,
-        rotation=turn @ found.rotation,
+        cell=cell, position=found.position @ turn.T, rotation=turn @ found.rotation,
         velocity=None if found.velocity is None else found.velocity @ turn.T,
-        notes=(*found.notes, f"{told}; turned, contents included"),
-        basis=basis,
-    )
+        notes=(*found.notes, f"{told}; turned, contents included"), basis=basis,
+    )  # fmt: skip
 
 
 def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configuration:
@@ -135,15 +125,12 @@ def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configurati
         return None if values is None else np.tile(values, (len(shifts), *[1] * (values.ndim - 1)))
 
     return found._replace(
-        species=tiled(found.species),
-        number=tiled(found.number),
-        position=(found.position + shifts[:, None]).reshape(-1, 3),
-        rotation=tiled(found.rotation),
-        velocity=tiled(found.velocity),
-        angular_momentum_body=tiled(found.angular_momentum_body),
+        species=tiled(found.species), number=tiled(found.number),
+        position=(found.position + shifts[:, None]).reshape(-1, 3), rotation=tiled(found.rotation),
+        velocity=tiled(found.velocity), angular_momentum_body=tiled(found.angular_momentum_body),
         cell=cell * np.array(repeat)[:, None],
         notes=(*found.notes, f"its {len(found.species)} molecules stand {' x '.join(map(str, repeat))} times"),
-    )
+    )  # fmt: skip
 
 
 def _read_molecules(
@@ -184,17 +171,11 @@ def _read_molecules(
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
     return Configuration(
-        species=matched.species,
-        position=matched.centre,
-        rotation=matched.rotation,
-        velocity=velocity,
-        angular_momentum_body=angular,
-        cell=atoms.cell,
+        species=matched.species, position=matched.centre, rotation=matched.rotation, velocity=velocity,
+        angular_momentum_body=angular, cell=atoms.cell,
         residual_rms=float(np.sqrt(matched.square @ sizes / sizes.sum())),
-        residual_max=float(matched.deviation.max()),
-        number=matched.number,
-        notes=tuple(notes),
-    )
+        residual_max=float(matched.deviation.max()), number=matched.number, notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
@@ -342,13 +323,9 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     if faults := [fault for fault in faults if fault]:
         raise StructureError(str(path), faults)
     return Configuration(
-        species=np.array([known.index(name) for name in saved.names])[saved.species],
-        position=state.position,
-        rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)),
-        velocity=state.velocity,
+        species=np.array([known.index(name) for name in saved.names])[saved.species], position=state.position,
+        rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)), velocity=state.velocity,
         angular_momentum_body=state.angular_momentum_body if turning else np.zeros((n, 3)),
-        cell=state.cell if np.isfinite(state.cell).all() else None,
-        residual_rms=0.0,
-        residual_max=0.0,
+        cell=state.cell if np.isfinite(state.cell).all() else None, residual_rms=0.0, residual_max=0.0,
         number=saved.residue_number,
-    )
+    )  # fmt: skip

@@ -46,14 +46,9 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
 
 
 def interactions(
-    scene: MolecularScene,
-    species: list[Molecule],
-    model: Model,
-    space: Space,
-    state: State,
-    basis: np.ndarray,
+    scene: MolecularScene, species: list[Molecule], model: Model, space: Space, state: State, basis: np.ndarray,
     pme_grid: tuple[int, int, int] | None,
-) -> Interactions:
+) -> Interactions:  # fmt: skip
     """The interactions of a resolved scene. Raises SceneError.
 
     basis, pme_grid : see `electrostatics`
@@ -77,22 +72,15 @@ def interactions(
     charged = ChargedSites(species, index, frozen, chosen, sites, exclusion_groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
-        found.terms | added.terms,
-        added.constants,
-        added.pressure,
-        found.tail,
-        added.force_error,
+        found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error,
         found.notes + added.notes,
-    )
+    )  # fmt: skip
 
 
 def _lennard_jones(
-    scene: MolecularScene,
-    species: list[Molecule],
-    index: np.ndarray,
-    named: list[np.ndarray],
+    scene: MolecularScene, species: list[Molecule], index: np.ndarray, named: list[np.ndarray],
     chosen: list[np.ndarray],
-) -> LennardJones:
+) -> LennardJones:  # fmt: skip
     """The law of the sites `chosen` of each species. Raises SceneError."""
     forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
     pairs = [

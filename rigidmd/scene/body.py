@@ -32,7 +32,7 @@ from rigidmd.scene.body_forces import (
     NonNegativeVector,
     PositiveVector,
     Wheel,
-)  # fmt: skip
+)
 from rigidmd.scene.limits import BodyWatch
 from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, location_of
 

@@ -23,7 +23,7 @@ from rigidmd.scene.validation import (
     location_of,
     numbers_out_of_range,
     validation_messages,
-)  # fmt: skip
+)
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -266,22 +266,12 @@ def molecule(
     if frame.kind == "point":
         body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
     return Molecule(
-        name=name,
-        title=title,
-        source=source,
-        residue_names=tuple(residue_names) or (name.upper()[:5],),
-        site_names=tuple(s.name for s in sites),
-        elements=tuple(s.element for s in sites),
-        masses=masses,
-        positions_body=body,
-        charges=np.array([s.charge_e or 0.0 for s in sites]),
-        sigma=np.array([s.sigma_A or 0.0 for s in sites]),
-        epsilon=np.array([s.epsilon for s in sites]),
-        mass=float(frame.mass),
-        inertia=frame.inertia,
-        kind=frame.kind,
-        parameters=tuple(s.parameters for s in sites),
-    )
+        name=name, title=title, source=source, residue_names=tuple(residue_names) or (name.upper()[:5],),
+        site_names=tuple(s.name for s in sites), elements=tuple(s.element for s in sites), masses=masses,
+        positions_body=body, charges=np.array([s.charge_e or 0.0 for s in sites]),
+        sigma=np.array([s.sigma_A or 0.0 for s in sites]), epsilon=np.array([s.epsilon for s in sites]),
+        mass=float(frame.mass), inertia=frame.inertia, kind=frame.kind, parameters=tuple(s.parameters for s in sites),
+    )  # fmt: skip
 
 
 def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:

@@ -1,1 +1,1 @@
-"""Code of users in a scene: forces, pair potentials, thermostats, and which files may be imported."""
+"""User code: forces, pair potentials, thermostats, and which files may be imported."""

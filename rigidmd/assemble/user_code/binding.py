@@ -1,4 +1,4 @@
-"""From what users give to the terms of a system."""
+"""Binds user code to a system: forces and a thermostat become terms, and errors in their code become messages."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 
 class UserTerms(NamedTuple):
-    """What users add to a system."""
+    """The terms that user code adds to a system."""
 
     terms: dict[str, NamedTuple]
-    python_forces: dict[str, Callable[[Any, State], None]]  # of those that Python computes: what the engine asks
-    moves: np.ndarray  # (3,) whether they may change components of the total momentum
+    python_forces: dict[str, Callable[[Any, State], None]]  # functions that compute terms in Python
+    changes_momentum: np.ndarray  # (3,) whether they may change components of the total momentum
     thermostat: Any
     notes: list[str]
-    words: dict[str, str]  # what each term is
-    tails: list[Tail]  # what the cutoffs of pair laws take away
+    descriptions: dict[str, str]  # of the terms
+    tails: list[Tail]  # tail corrections of pair potentials
 
 
 def custom_forces(scene: "MolecularScene") -> list[Any]:
-    """The objects of [[forces.custom]]. Raises SceneError with every fault."""
+    """The objects of [[forces.custom]]. Raises SceneError with all errors."""
     found, faults = [], []
     for k, entry in enumerate(scene.forces.custom):
         try:
@@ -49,7 +49,7 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
             faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.errors]
         except ValueError as error:
             faults.append((None, f"forces.custom.{k}: {error}"))
-    if faults:  # of a file once
+    if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
         raise SceneError(scene.source, list(messages.values())[::-1])
     return found
@@ -71,15 +71,15 @@ def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
     if isinstance(made, type) or (callable(made) and not isinstance(made, Force)):
         try:
             made = made(**entry.parameters)
-        except (Exception, SystemExit) as error:  # whatever a stranger's code raises
+        except (Exception, SystemExit) as error:  # user code may raise anything
             raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
-        raise ValueError(f"parameters would do nothing: {entry.name} is not called with any")
+        raise ValueError(f"parameters would do nothing: {entry.name} is an object, which is not called")
     return _Named(entry.name, made)
 
 
 class _Named(NamedTuple):
-    """An object under the name that a scene gives it."""
+    """An object and its name in the scene."""
 
     name: str
     made: Any
@@ -87,7 +87,7 @@ class _Named(NamedTuple):
 
 @contextmanager
 def user_errors_explained(system: "System") -> Iterator[None]:
-    """Turn errors of a user's code before the first step, Numba's too, into a SceneError."""
+    """Convert errors of user code before the first step, including Numba's, to a SceneError."""
     try:
         yield
     except UserForceError as error:
@@ -109,18 +109,18 @@ def user_errors_explained(system: "System") -> Iterator[None]:
 
 
 def user_terms(system: "System") -> UserTerms:
-    """The terms of what a scene and Python add. Raises SceneError with every fault."""
+    """The terms of [[forces.custom]] and of user code from Python. Raises SceneError with all errors."""
     scene = system.scene
-    everything = UserCode((*custom_forces(scene), *scene.user_code.forces))
-    names = everything.force_names([*system.terms, *system.constants])
+    user_code = UserCode((*custom_forces(scene), *scene.user_code.forces))
+    names = user_code.force_names([*system.terms, *system.constants])
     found = UserTerms({}, {}, np.zeros(3, bool), scene.user_code.thermostat, [], {}, [])
     faults = []
-    for name, given in zip(names, everything.forces, strict=True):
+    for name, given in zip(names, user_code.forces, strict=True):
         made = given.made if isinstance(given, _Named) else given
         try:
             term = _term(made, name, system, found)
             if not isinstance(term, PairForces):
-                found.moves[:] |= changes_momentum(term)
+                found.changes_momentum[:] |= changes_momentum(term)
         except (PairPotentialError, SceneError) as error:
             faults += [f"{name}: {fault}" for fault in error.errors]
             continue
@@ -132,12 +132,12 @@ def user_terms(system: "System") -> UserTerms:
     if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
         faults.append(
             f"thermostat: {thermostat!r:.60} is neither a NamedTuple of a class with rigidmd.compiled_thermostat nor "
-            "has it a method for_stage(system, k) that makes one"
+            "an object with a method for_stage(system, k) that makes one"
         )
     if faults:
         raise SceneError(scene.source, faults)
     if thermostat is not None:
-        found.notes.append(f"thermostat: {name_of(thermostat)}, from Python, in place of that of every stage")
+        found.notes.append(f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all stages")
     return found
 
 

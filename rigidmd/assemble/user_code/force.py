@@ -1,4 +1,4 @@
-"""Forces of users in plain Python."""
+"""Forces that users write in plain Python."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -17,15 +17,15 @@ EVERY = (True, True, True)
 
 
 class HasTerm(Protocol):
-    """What makes a compiled term from the numbers of a system."""
+    """An object that makes a compiled term for a system."""
 
     def term(self, system: "System") -> Any:
-        """The term, a NamedTuple of a class with `compiled_force`."""
+        """A NamedTuple of a class with `compiled_force`."""
         ...
 
 
 class HasStage(Protocol):
-    """What makes a compiled thermostat for a stage."""
+    """An object that makes a compiled thermostat for each stage."""
 
     def for_stage(self, system: "System", k: int) -> Any:
         """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
@@ -33,7 +33,7 @@ class HasStage(Protocol):
 
 
 class UserForceError(SimulationError):
-    """A force of a user's cannot be computed."""
+    """A force of user code cannot be computed."""
 
 
 class Force:
@@ -43,12 +43,12 @@ class Force:
         def on_molecules(self, state):
             return 0.5 * (state.position**2).sum(), -state.position
 
-    It is asked once for every new set of positions, between steps of the compiled loop; a `compiled_force` is faster.
+    It is called once for every new set of positions, between steps of the compiled loop; a `compiled_force` is faster.
 
     name : in logs and messages; default: the name of the class
-    changes_momentum : which components of the total momentum it may change; all but of forces between molecules
-    tied_to_places : whether its energy depends on places in the lab, which excludes a barostat. Otherwise it must give
-        its virial as the last of what it returns
+    changes_momentum : which components of the total momentum it may change; False for forces between molecules
+    tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If False, its virial
+        must be the last of the returned values
     """
 
     name: ClassVar[str | None] = None
@@ -56,7 +56,7 @@ class Force:
     tied_to_places: ClassVar[bool] = True
 
     def begin(self, system: "System") -> None:
-        """Called once with the system: `sites` with names, elements, masses and charges, `species`, `model`."""
+        """Called once with the system, which has `sites` (names, elements, masses, charges), `species` and `model`."""
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
         """(energy in kJ/mol, forces (s, 3) on all sites in kJ/mol/Å) at their positions (s, 3), Å, not wrapped.
@@ -74,7 +74,7 @@ class Force:
 
 
 class BoundForce:
-    """A `Force` in a system: asks it, checks what it gives, and turns forces on sites into those on bodies."""
+    """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on bodies."""
 
     def __init__(self, force: Force, name: str, system: "System"):
         self.force, self.name, self.system = force, name, system
@@ -87,12 +87,12 @@ class BoundForce:
 
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
         """Fill a workspace with the forces at a state. Raises OwnError."""
-        seen = State(*(_read_only(array) for array in state))
+        state = State(*(_read_only(array) for array in state))
         if self._by_site:
-            position = _read_only(self.system.site_positions(seen))
-            energy, force, torque, virial = self._of_sites(position, seen)
+            position = _read_only(self.system.site_positions(state))
+            energy, force, torque, virial = self._of_sites(position, state)
         else:
-            energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, seen), 4)
+            energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, state), 4)
         shape = workspace.force.shape
         self._fill(workspace.force, force, "forces", shape)
         self._fill(workspace.torque_body, torque, "torques", workspace.torque_body.shape)
@@ -114,18 +114,18 @@ class BoundForce:
         energy, force, virial, _ = self._parts(self._called("on_sites", self.force.on_sites, position, state), 3)
         on_sites = np.zeros(position.shape)
         self._fill(on_sites, force, "forces", position.shape, system.sites.molecule, 1.0)
-        of = system.sites.molecule
+        molecule = system.sites.molecule
         total = np.zeros((len(state.velocity), 3))
-        np.add.at(total, of, on_sites)
+        np.add.at(total, molecule, on_sites)
         torque = None
         if len(state.rotation):
             lab = np.zeros_like(total)
-            np.add.at(lab, of, np.cross(position - state.position[of], on_sites))
+            np.add.at(lab, molecule, np.cross(position - state.position[molecule], on_sites))
             torque = np.einsum("nji,nj->ni", state.rotation, lab)
         return energy, total, torque, virial
 
     def _parts(self, found: Any, most: int) -> list:
-        """Energy and up to three further values, None for those that are left out."""
+        """Energy and three further values, None for omitted ones."""
         if not isinstance(found, tuple) or not 2 <= len(found) <= most:
             given = f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
             more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
@@ -137,14 +137,9 @@ class BoundForce:
         return [energy, *found[1:], *[None] * (4 - len(found))]
 
     def _fill(
-        self,
-        room: np.ndarray,
-        given: Any,
-        what: str,
-        shape: tuple,
-        molecule: np.ndarray | None = None,
+        self, room: np.ndarray, given: Any, what: str, shape: tuple, molecule: np.ndarray | None = None,
         size: float = KJ_PER_MOL,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Copy an array into its room; None is 0."""
         if given is None:
             room[:] = 0.0
@@ -168,7 +163,7 @@ class BoundForce:
     def _called(self, what: str, function: Callable, *arguments: Any) -> Any:
         try:
             return function(*arguments)
-        except (Exception, SystemExit) as error:  # whatever a stranger's function raises
+        except (Exception, SystemExit) as error:  # user code may raise anything
             trace = error.__traceback__
             while trace is not None and trace.tb_next is not None:
                 trace = trace.tb_next
@@ -177,7 +172,7 @@ class BoundForce:
 
 
 def _numbers(given: Any) -> np.ndarray | None:
-    """An array of real numbers; None of what is none."""
+    """An array of real numbers; None for anything else."""
     try:
         return None if np.iscomplexobj(given) else np.asarray(given, float)
     except (TypeError, ValueError):
@@ -191,9 +186,9 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def changes_momentum(term: Any) -> np.ndarray:
-    """Components (3,) of the total momentum that a force from outside may change. Raises ValueError."""
-    said = getattr(term, "changes_momentum", EVERY)
-    each = said if isinstance(said, tuple | list | np.ndarray) else (said,)
+    """Components (3,) of the total momentum that a force may change. Raises ValueError."""
+    given = getattr(term, "changes_momentum", EVERY)
+    each = given if isinstance(given, tuple | list | np.ndarray) else (given,)
     if len(each) not in (1, 3) or not all(isinstance(one, bool | np.bool_) for one in each):
-        raise ValueError(f"changes_momentum is {said!r:.60}, must be three truth values, for x, y, z")
-    return np.array(np.broadcast_to(said, 3), bool)
+        raise ValueError(f"changes_momentum is {given!r:.60}, must be three truth values, for x, y, z")
+    return np.array(np.broadcast_to(given, 3), bool)

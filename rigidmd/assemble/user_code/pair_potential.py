@@ -129,15 +129,10 @@ class PairLaw:
             raise PairPotentialError("no pair of sites of the scene has parameters")
         first = np.argwhere(acts)[0]
         law = CustomPotential(
-            cutoff,
-            shape,
-            formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])),
-            formula.shared,
-            kind.astype(np.int32),
-            np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]),
-            ends,
+            cutoff, shape, formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])), formula.shared,
+            kind.astype(np.int32), np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]), ends,
             acts,
-        )
+        )  # fmt: skip
         frozen = (system.model.inverse_mass == 0)[index]
         return BoundPotential(
             pair_forces(law, sites, exclusion_groups(sites, frozen)),
@@ -294,18 +289,11 @@ def _has(energy: Any, formula: Formula, name: str) -> bool:
 
 
 def pair_law(
-    energy: "str | Callable | None" = None,
-    parameters: Mapping[str, Any] | None = None,
-    *,
-    table: Columns | None = None,
-    sites: Sequence[str] = (),
-    pairs: Mapping[tuple[str, str], Any] | None = None,
-    mixing: Mapping[str, Rule] | None = None,
-    truncation: TruncationName | None = None,
-    cutoff_A: float | None = None,
-    switch_start_A: float | None = None,
-    name: str = "",
-) -> PairLaw:
+    energy: "str | Callable | None" = None, parameters: Mapping[str, Any] | None = None, *,
+    table: Columns | None = None, sites: Sequence[str] = (), pairs: Mapping[tuple[str, str], Any] | None = None,
+    mixing: Mapping[str, Rule] | None = None, truncation: TruncationName | None = None, cutoff_A: float | None = None,
+    switch_start_A: float | None = None, name: str = "",
+) -> PairLaw:  # fmt: skip
     """A law between pairs of sites of different molecules, for `Simulation(scene, forces=[...])`.
 
     rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
