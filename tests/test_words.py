@@ -65,9 +65,12 @@ def refused_in(text):
 
 
 def without_code(text):
-    """Text in which quoted code is blank, so that positions and lines stay."""
+    """Text in which quoted code and the targets of links are blank, so that positions and lines stay."""
     return re.sub(
-        r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+", lambda m: re.sub(r"[^\n]", " ", m.group()), text, flags=re.DOTALL
+        r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+|\]\([^)\s]*\)",
+        lambda m: re.sub(r"[^\n]", " ", m.group()),
+        text,
+        flags=re.DOTALL,
     )
 
 
