@@ -313,7 +313,7 @@ def test_body_in_fluid():
     assert results["theta"][-1] == pytest.approx(np.pi / 2, abs=1e-6)
     assert np.hypot(results["vx"][-1], results["vy"][-1]) < 1e-6 * speed
     assert worst(results, "energy") < 1e-8
-    added = system.body.flight.inertial_mass - system.mass
+    added = system.body.translation.inertial_mass - system.mass
     assert added[0] > 0.85 * displaced > 0.2 * displaced > added[2]  # a long body carries little end on
 
 
@@ -389,14 +389,14 @@ def test_satellite_mass_loss():
 def test_what_a_scene_lacks_is_not_there():
     parts = {path.stem: run(path.stem).system for path in BODIES}
     top = parts["heavy_top_1"]
-    assert [type(part).__name__ for part in top.body] == ["Pinned", "SplitRotor", "Inertial", "NoResistance"]
+    assert [type(part).__name__ for part in top.body] == ["NoTranslation", "SplitRotor", "Inertial", "NoResistance"]
     assert top.state.position.shape == (0, 3)
     stone = parts["dropped_stone"]
-    assert [type(part).__name__ for part in stone.body] == ["Free", "NoRotor", "Turning", "NoResistance"]
+    assert [type(part).__name__ for part in stone.body] == ["FreeTranslation", "NoRotor", "Turning", "NoResistance"]
     assert stone.state.rotation.shape == (0, 3, 3)
     assert "q11" not in run("dropped_stone").samples.columns
     assert type(parts["satellite_wheel"].body.rotor).__name__ == "DrivenRotor"
-    assert type(parts["body_in_fluid"].body.flight).__name__ == "Immersed"
+    assert type(parts["body_in_fluid"].body.translation).__name__ == "FluidTranslation"
     assert all(isinstance(system.body, Body) for system in parts.values())
 
 
@@ -418,7 +418,7 @@ def turned_alone(inertia, momentum, dt, steps, scheme):
     return state.angular_momentum_body[0]
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def path(rotor, rotation, momentum, h, steps):
     """Let every body turn, all of species 0: L (steps, n, 3) after each step."""
     seen = np.empty((steps, *momentum.shape))

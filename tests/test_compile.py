@@ -50,18 +50,18 @@ def inner(x):
     return np.add(x, x)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def twice(x):
     return inner(x)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def four_times(x):
     return inner(inner(x))
 """
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def doubled(x):
     return _twice(x)
 
@@ -88,7 +88,7 @@ def test_the_index_of_a_cache_may_be_of_our_class():
 
 
 def test_a_dispatcher_opens_its_cache_only_to_compile():
-    @kernel(outer=True)
+    @kernel(from_python=True)
     def unused(x):
         return x
 
@@ -113,12 +113,12 @@ def test_an_inner_kernel_has_no_wrapper_and_says_so():
     def inner(x):
         return x + x
 
-    @kernel(outer=True)
+    @kernel(from_python=True)
     def outer(x):
         return x + x
 
     assert type(inner) is InnerKernel
-    with pytest.raises(TypeError, match=r"inner is for compiled code only; for Python, use kernel\(outer=True\)"):
+    with pytest.raises(TypeError, match=r"inner is for compiled code only; for Python, use kernel\(from_python=True\)"):
         inner(2.0)
     inner.compile((types.float64,))
     outer(2.0)
@@ -128,7 +128,7 @@ def test_an_inner_kernel_has_no_wrapper_and_says_so():
 @pytest.mark.usefixtures("empty_cache")
 @pytest.mark.parametrize("counted", [True, False])
 def test_references_are_not_counted_where_it_is_asked_for(counted):
-    @kernel(outer=True, counted=counted)
+    @kernel(from_python=True, count_references=counted)
     def after(values, count):
         part = values
         for _ in range(count):
@@ -145,7 +145,7 @@ def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
     def inner(x):
         return x + x
 
-    @kernel(outer=True)
+    @kernel(from_python=True)
     def outer(x):
         return inner(x) + 1.0
 
@@ -160,7 +160,7 @@ def test_an_inner_kernel_has_no_machine_code_and_is_optimised_in_its_caller():
 
 
 def test_an_inner_kernel_is_kept_and_linked_into_other_kernels_later(tmp_path):
-    (tmp_path / "assemble/user_code.py").write_text(LATER)
+    (tmp_path / "own.py").write_text(LATER)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }  # fmt: skip
@@ -197,8 +197,8 @@ class Mixed(NamedTuple):
 
 
 @task()
-def _tell(parcel, block):
-    mixed, found = load_arguments(parcel)
+def _tell(task_arguments, block):
+    mixed, found = load_arguments(task_arguments)
     found[0], found[1], found[2] = mixed.small, mixed.flags[0], mixed.flags[1]
     found[3], found[4], found[5] = mixed.plane[1, 2], mixed.single, mixed.flag
     found[6], found[7] = mixed.inner[0], mixed.inner[1][0][1]
@@ -215,17 +215,17 @@ def test_values_are_laid_down_as_compiled_code_has_them():
     BoundTask(_tell, (mixed, found))()
     assert found.tolist() == [-3, 1, 0, 5, 0.5, 1, 65000, 8, 2.5, -(2**40), 5, 5]
     assert plane[0, 0] == -1.0
-    context, laid = cpu_target.target_context, NumbaStruct(mixed)
-    assert ctypes.sizeof(laid._memory) == context.get_abi_sizeof(context.get_value_type(laid.kind))
+    context, struct = cpu_target.target_context, NumbaStruct(mixed)
+    assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(context.get_value_type(struct.kind))
 
 
 def test_what_cannot_be_laid_down_or_has_another_type_is_named():
-    with pytest.raises(TypeError, match="unicode_type cannot be laid down"):
+    with pytest.raises(TypeError, match="unicode_type cannot be struct down"):
         NumbaStruct((1.0, "text"))
     code = Code(add=(_add, (np.zeros(3), 0.0)))
-    assert code.lay_down((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
+    assert code.to_struct((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
     with pytest.raises(TypingError, match=r"add was compiled for .*float64, 1d.*, not for .*float32, 1d"):
-        code.lay_down((np.zeros(3, np.float32), 0.0))
+        code.to_struct((np.zeros(3, np.float32), 0.0))
 
 
 # --- addresses -------------------------------------------------------------------------------------------------------
@@ -238,19 +238,19 @@ class Content(NamedTuple):
     code: Code
 
 
-@task(counted=False)
-def _add(parcel, block):
-    values, x = load_arguments(parcel)
+@task(count_references=False)
+def _add(task_arguments, block):
+    values, x = load_arguments(task_arguments)
     values[block] += x
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def add_once_and_in_blocks(content, blocks):
     call(content.code, "add", pack_arguments((content.values, 1.0)))
     call_blocks(content.code, "add", pack_arguments((content.values, 2.0)), blocks)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def call_what_is_not_there(content):
     call(content.code, "subtract", pack_arguments((content.values, 1.0)))
 
@@ -272,7 +272,7 @@ def test_an_address_is_not_called_with_what_it_was_not_compiled_for(strange):
 
 
 def test_a_task_that_is_not_there_is_named():
-    with pytest.raises(TypingError, match="there is no task subtract; the tasks are add"):
+    with pytest.raises(TypingError, match="unknown task subtract; the tasks are add"):
         call_what_is_not_there(content_of(np.zeros(2)))
 
 
@@ -288,17 +288,17 @@ def test_every_block_is_worked_on_once_whichever_thread_takes_it():
 #: Compiles `_add` for several types while a helper does so too, from the other end; prints what was read from the cache.
 BOTH = """
 import numba, numpy as np
-from rigidmd.compile import Parcel, ahead
+from rigidmd.compile import TaskArguments, second_process
 from test_compile import _add
 contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
-wanted = [(*_add.name, Parcel(numba.typeof(content))) for content in contents]
-with ahead.helped(wanted):
-    helper = ahead._helper.get()
-    with helper._news:
-        helper._news.wait_for(lambda: helper._over or len(helper._done) >= 2)
-    for _, _, parcel in wanted:
-        _add.address(parcel)
-print([_add.compiled[parcel]._cache_hits for _, _, parcel in wanted][-2:])
+wanted = [(*_add.name, TaskArguments(numba.typeof(content))) for content in contents]
+with second_process.use_helper(wanted):
+    helper = second_process._helper.get()
+    with helper._changed:
+        helper._changed.wait_for(lambda: helper._ended or len(helper._done) >= 2)
+    for _, _, kind in wanted:
+        _add.address(kind)
+print([_add.compiled[kind]._cache_hits for _, _, kind in wanted][-2:])
 """
 
 
@@ -316,7 +316,9 @@ def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
 
 
 def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
-    lost = BOTH.replace("with ahead.helped", "ahead.CHILD = 'raise SystemExit'\nwith ahead.helped")
+    lost = BOTH.replace(
+        "with second_process.use", "second_process.HELPER_PROGRAM = 'raise SystemExit'\nwith second_process.use"
+    )
     done = with_compilers("2", lost, tmp_path)
     assert done.stdout.split("\n")[0] == "[0, 0]", done.stderr
 
@@ -324,7 +326,7 @@ def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
 #: As an engine does it: how often its codes are made, and whether each that is made last can be called.
 TOGETHER = """
 import numpy as np
-from rigidmd.compile import Code, ahead, compile_together
+from rigidmd.compile import Code, compile_together
 from test_compile import _add
 contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
 made = []
@@ -351,7 +353,7 @@ def test_one_compiler_plans_nothing(tmp_path):
 
 @pytest.mark.parametrize("named", ["0", "three", ""])
 def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
-    asked = "from rigidmd.compile.second_process import compilers\ncompilers()"
+    asked = "from rigidmd.compile.second_process import compiler_processes\ncompiler_processes()"
     done = with_compilers(named, asked, tmp_path)
     assert f"RIGIDMD_COMPILERS is {named!r}, must be 1 or 2" in done.stderr
 
@@ -417,13 +419,13 @@ def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
     assert not (tmp_path / "cache").exists()
 
 
-KERNEL = "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef twice(x):\n    return 2 * x\n"
+KERNEL = "from rigidmd.compile import kernel\n@kernel(from_python=True)\ndef twice(x):\n    return 2 * x\n"
 
 
 def compiled_in(folder, tmp_path, before=""):
     """Run a kernel with the cache in a folder: what it printed, what it warned of."""
-    if not (tmp_path / "assemble/user_code.py").exists():  # kernels are kept by the time of their file
-        (tmp_path / "assemble/user_code.py").write_text(KERNEL)
+    if not (tmp_path / "own.py").exists():  # kernels are kept by the time of their file
+        (tmp_path / "own.py").write_text(KERNEL)
     environment = os.environ | {
         "RIGIDMD_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
     }  # fmt: skip
@@ -473,7 +475,7 @@ def test_a_kernel_is_compiled_once_for_all_constant_arguments():
     def plus(x, n):
         return x + n
 
-    @kernel(outer=True)
+    @kernel(from_python=True)
     def several(x):
         return plus(x, 1) + plus(x, 2) + plus(x, 3)
 
@@ -499,7 +501,7 @@ def compiled_functions():
 
 def test_loops_without_counted_references_take_elements_by_their_index():
     """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is safe."""
-    uncounted = [(name, tree) for name, tree, keys in compiled_functions() if keys.get("counted") == "False"]
+    uncounted = [(name, tree) for name, tree, keys in compiled_functions() if keys.get("count_references") == "False"]
     assert {"block_forces", "place_block", "update_list"} <= {name for name, _ in uncounted}
     strange = []
     for name, tree in uncounted:

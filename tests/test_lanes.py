@@ -27,7 +27,7 @@ def cube(x):
     return one * two
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def every_operation(a, b, out, sums):
     width = simd.lanes_of(a)
     x, y = simd.load(a, 0), simd.load(b, 0)
@@ -64,7 +64,7 @@ def test_vectors_compute_as_arrays_do(dtype):
     assert sums[3] == 3
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def sums_of_six(x, out):
     width = simd.lanes_of(x)
     one = simd.load(x, 0), simd.load(x, width), simd.load(x, 2 * width)
@@ -83,7 +83,7 @@ def test_six_sums_over_lanes_are_added_in_pairs(dtype):
     assert out == pytest.approx(expected, rel=0, abs=16 * float(np.finfo(dtype).eps))
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def records_in_lanes(vectors, matrices, out):
     width = simd.lanes_of(out)
     x, y, z = load_vectors(vectors, 1)
@@ -117,7 +117,7 @@ def root(x):
     return found
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def inverses(x, out):
     width = simd.lanes_of(x)
     for i in range(0, len(x), width):
@@ -151,7 +151,7 @@ def test_the_stack_is_aligned_to_vectors():
     assert f"andq\t$-{SIMD_BITS // 8}, %rsp" in code
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def part(x, out):
     width = simd.lanes_of(x)
     whole, rest = simd.split_integer_part(simd.load(x, 0))
@@ -175,7 +175,7 @@ def test_numbers_are_parted_into_whole_and_rest():
     assert np.array_equal(out[width:], np.where(np.trunc(x) < 5, x, 0))
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def pick(table, x, out):
     k, _ = simd.split_integer_part(simd.load(x, 0))
     simd.store(out, 0, simd.permute_two(simd.load(table, 0), simd.load(table, 16), k))
@@ -198,8 +198,8 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
     engine.evaluate(state)
     kind = {"double": "double", "mixed": "float"}[precision]
     for own in engine.workspaces.values():
-        parcel = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums)))
-        fresh = numba.cfunc(types.void(parcel, types.intp), **pairs._forces.options)(pairs._forces.function)
+        task_arguments = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums)))
+        fresh = numba.cfunc(types.void(task_arguments, types.intp), **pairs._forces.options)(pairs._forces.function)
         vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
         code = fresh.inspect_llvm()
         assert "NRT" not in code  # nothing in it counts references

@@ -16,13 +16,13 @@ from support import ROOT, SCHEMES, small_scene
 from rigidmd import Every, Simulation, run_together
 from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, set_threads, task
 from rigidmd.compile.machine import MOST_THREADS
-from rigidmd.compile.thread_pool import CLAIMED, FIRST_HELPER, SLEEPS, _crew, _pause, _read, _take, _write  # noqa: F401
+from rigidmd.compile.thread_pool import FIRST_WORKER, RANGE_JOBS, SLEEPS, _pause, _pool, _read, _run_ranges, _write  # noqa: F401
 from rigidmd.errors import SimulationError
 
 
 @task()
-def _count(parcel, block):
-    seen, work = load_arguments(parcel)
+def _count(task_arguments, block):
+    seen, work = load_arguments(task_arguments)
     total = 0.0
     for n in range(work):
         total += np.sqrt(n + block)
@@ -31,18 +31,18 @@ def _count(parcel, block):
 
 
 @task()
-def _count_within(parcel, block):
-    code, seen = load_arguments(parcel)
+def _count_within(task_arguments, block):
+    code, seen = load_arguments(task_arguments)
     call_blocks(code, "count", pack_arguments((seen[block], 10)), seen.shape[1])
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _run(code, seen, work, times):
     for _ in range(times):
         call_blocks(code, "count", pack_arguments((seen, work)), len(seen))
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _run_within(code, inner, seen):
     call_blocks(code, "within", pack_arguments((inner, seen)), len(seen))
 
@@ -70,15 +70,15 @@ def test_every_block_is_done_once(threads, blocks, work):
 
 
 @task()
-def _note(parcel, block):
-    order = load_arguments(parcel)
+def _note(task_arguments, block):
+    order = load_arguments(task_arguments)
     order[0] += 1
     order[order[0]] = block
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _take_alone(cells, job, address, room, blocks, own, threads):
-    return _take(cells, job, address, room, blocks, own, threads)
+    return _run_ranges(cells, job, address, room, blocks, own, threads)
 
 
 @pytest.mark.parametrize(
@@ -94,11 +94,11 @@ def _take_alone(cells, job, address, room, blocks, own, threads):
     ],
 )
 def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(own, threads, claimed, expected):
-    cells, order = np.zeros(FIRST_HELPER, np.int64), np.zeros(7, np.int64)
-    cells[CLAIMED : CLAIMED + 6] = claimed
+    cells, order = np.zeros(FIRST_WORKER, np.int64), np.zeros(7, np.int64)
+    cells[RANGE_JOBS : RANGE_JOBS + 6] = claimed
     code = Code(note=(_note, order))
-    laid = code.lay_down(order)
-    last = _take_alone(cells.ctypes.data, 4, code.address("note"), laid.address, 6, own, threads)
+    struct = code.to_struct(order)
+    last = _take_alone(cells.ctypes.data, 4, code.address("note"), struct.address, 6, own, threads)
     assert order[1 : order[0] + 1].tolist() == expected
     assert last == (len(expected) == 6)
 
@@ -114,8 +114,8 @@ def _run_freely(code, seen, work, times):
     _run(code, seen, work, times)
 
 
-def test_two_leaders_at_once_each_have_their_blocks_done_once():
-    """Without Python's lock, so that each finds the crew at work for the other."""
+def test_two_calling_threads_at_once_each_have_their_blocks_done_once():
+    """Without Python's lock, so that each finds the pool busy with the other."""
     found = [np.zeros((16, 2)), np.zeros((40, 2))]
     code = Code(count=(_count, (found[0], 10)))
     both = [threading.Thread(target=_run_freely, args=(code, seen, 10, 20_000)) for seen in found]
@@ -245,9 +245,9 @@ def test_what_cannot_run_together_is_refused(twice, jobs, word):
 
 
 @task()
-def _meet(parcel, block):
+def _meet(task_arguments, block):
     """Wait until the other of two blocks has begun, or for so many looks; note whether it has."""
-    at, most = load_arguments(parcel)
+    at, most = load_arguments(task_arguments)
     _write(at, block, 1)
     looks = 0
     while _read(at, 1 - block) == 0 and looks < most:
@@ -256,7 +256,7 @@ def _meet(parcel, block):
     _write(at, 2 + block, _read(at, 1 - block))
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _run_meeting(code, at, most):
     call_blocks(code, "meet", pack_arguments((at, most)), 2)
 
@@ -270,12 +270,12 @@ def met(most: int) -> list[int]:
 
 HELPER = """
 import time
-from test_threads import FIRST_HELPER, SLEEPS, _crew, met, set_threads
+from test_threads import FIRST_WORKER, SLEEPS, _pool, met, set_threads
 set_threads(1)
 assert met(1000) == [0, 1]
 set_threads(2)
 assert met(10**12) == [1, 1]
-while not _crew.cells[FIRST_HELPER + SLEEPS]:
+while not _pool.cells[FIRST_WORKER + SLEEPS]:
     time.sleep(0.01)
 assert met(10**12) == [1, 1]
 """
@@ -291,7 +291,7 @@ def test_a_helper_helps_then_sleeps_and_is_woken():
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_forked_process_has_a_crew_of_its_own():
+def test_a_forked_process_starts_its_own_threads():
     seen = np.zeros((16, 2))
     code = Code(count=(_count, (seen, 10)))
     child = os.fork()
@@ -301,7 +301,7 @@ def test_a_forked_process_has_a_crew_of_its_own():
             _run(code, seen, 10, 100)  # without helpers, then with new ones
             set_threads(MOST_THREADS)
             _run(code, seen, 10, 100)
-            done = 0 if (seen[:, 0] == 200).all() and _crew.hired == MOST_THREADS - 1 else 2
+            done = 0 if (seen[:, 0] == 200).all() and _pool.started == MOST_THREADS - 1 else 2
         finally:
             os._exit(done)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -1,13 +1,13 @@
-"""The interface to Numba: how kernels are compiled, cached and called by address, and SIMD vectors.
+"""The interface to Numba: kernels are compiled, cached and called by address, and SIMD vectors.
 
-The names that the author of a term needs are exported here; `lanes` has the vectors.
+The names that the author of a term needs are exported here; `simd` has the vectors.
 """
 
 from rigidmd.compile import settings  # noqa: F401  (before Numba is loaded)
 from rigidmd.compile.code import (
     BoundTask,
     Code,
-    Task,
+    CompiledTask,
     TaskArguments,
     call,
     call_blocks,
@@ -27,8 +27,8 @@ __all__ = [
     "SIMD_BITS",
     "BoundTask",
     "Code",
+    "CompiledTask",
     "NumbaStruct",
-    "Task",
     "TaskArguments",
     "call",
     "call_address",

@@ -1,4 +1,4 @@
-"""Kernels: compiled functions, with the compiler options that this engine needs."""
+"""Kernels: functions compiled by Numba, with the compiler options that rigidmd needs."""
 
 import inspect
 from collections.abc import Callable
@@ -11,34 +11,42 @@ from numba.extending import overload
 
 from rigidmd.compile.numba_private import LINKED_OPTIONS, dispatcher, reference_counting
 
+#: Error that compiling a user's function may raise.
+CompileError = NumbaError
 
-def kernel(function: Callable | None = None, *, inline=False, counted=True, outer=False) -> Any:
+
+def kernel(
+    function: Callable | None = None, *, inline: bool = False, count_references: bool = True, from_python: bool = False
+) -> Any:
     """`numba.njit`, cached on disk.
 
-    There are no fast-math flags. With them LLVM rounds a force otherwise where its energy is computed beside it, and a
-    run would depend on who looks at it; a run from the cache once differed in its last bits from one that compiled.
-    Products and sums of vectors are multiply-adds by what the source says, see `lane_types`.
+    There are no fast-math flags. With them LLVM rounds a force differently if its energy is computed too, so that a run
+    would depend on its observers, and a run from the cache once differed in its last bits from one that compiled.
+    Which products and sums of vectors are multiply-adds follows from the source, see `simd_types`.
 
-    inline: LLVM inlines the function wherever it is called. For functions in an inner loop: a term is passed as its
-    fields, forty arguments or more, and such a call costs more than a pair of sites.
-    counted: False for a loop that makes views of arrays but neither allocates nor returns arrays, and for all that it
-    calls: references are then not counted. Atomic reference counting raised a vector of pairs from 7 ns to 47 ns. Such
-    a loop must read elements by index: iteration over a view crashed. Its caller must not rebind, in a loop, arrays
-    that it passes: the new arrays were freed while in use.
-    outer: True if Python calls the function, which then runs without Python's lock.
+    inline: LLVM inlines the function into every caller. For functions in an inner loop: a term is passed as its fields,
+    forty arguments or more, and such a call costs more than a pair of sites.
+    count_references: False for a loop that makes views of arrays but neither allocates nor returns arrays, and for all
+    functions that it calls. Atomic reference counting raised a vector of pairs from 7 ns to 47 ns. Such a loop must
+    read elements by index, because iteration over a view crashed. Its caller must not rebind, in a loop, arrays that it
+    passes, because the new arrays were freed while in use.
+    from_python: True if Python calls the function, which then runs without Python's lock.
     """
     if function is None:
-        return lambda f: kernel(f, inline=inline, counted=counted, outer=outer)
-    return dispatcher(function, compiler_options(inline) | reference_counting(counted), outer)
+        return lambda f: kernel(f, inline=inline, count_references=count_references, from_python=from_python)
+    return dispatcher(function, compiler_options(inline) | reference_counting(count_references), from_python)
 
 
-def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=False, counted=True) -> Any:
+def implements(
+    stub: Callable, kinds: type | tuple[type, ...] = (), *, inline: bool = False, count_references: bool = True
+) -> Any:
     """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller.
 
-    kinds : NamedTuple classes; the function is then what `stub` does if its first argument is of one of these. Without
-        them the function is called with the types of the arguments, and returns what `stub` does for them, or None
+    kinds : NamedTuple classes; the function implements `stub` if its first argument is of one of these. Without them
+        the function is called with the types of the arguments, and returns an implementation for them, or None
     """
-    register = overload(stub, jit_options=compiler_options(inline) | reference_counting(counted) | LINKED_OPTIONS)
+    options = compiler_options(inline) | reference_counting(count_references) | LINKED_OPTIONS
+    register = overload(stub, jit_options=options)
     if not kinds:
         return register
     classes = kinds if isinstance(kinds, tuple) else (kinds,)
@@ -54,20 +62,16 @@ def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, inline=Fa
     return register_for_kinds
 
 
+def compile_user_function(function: Callable, inline: bool = False) -> Callable:
+    """A user's function for compiled code, with the options of a kernel; it is not cached on disk by itself."""
+    return numba.njit(**compiler_options(inline))(getattr(function, "py_func", function))
+
+
 def compiler_options(inline: bool) -> dict:
-    """Options that every kernel has."""
+    """Numba options that every kernel has."""
     return {"error_model": "numpy"} | ({"forceinline": True} if inline else {})
 
 
 def is_a(numba_type, named_tuple) -> bool:
-    """Whether a Numba type is that of the given NamedTuple class; overloads use this to choose."""
+    """Whether a Numba type belongs to the given NamedTuple class; for overloads that choose by type."""
     return isinstance(numba_type, types.BaseNamedTuple) and numba_type.instance_class is named_tuple
-
-
-#: What compiling a user's code may raise.
-CompileError = NumbaError
-
-
-def compile_user_function(function: Callable, inline: bool = False) -> Callable:
-    """A user's function for compiled code, with the options that a kernel has; it is not kept on disk by itself."""
-    return numba.njit(**compiler_options(inline))(getattr(function, "py_func", function))

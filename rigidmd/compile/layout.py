@@ -1,7 +1,7 @@
-"""Values of Python as compiled code has them in memory, written there without compiling anything.
+"""Values of Python in memory as compiled code stores them, without compiling anything.
 
-Numba's own way, a call from Python, compiles code that takes apart every array of every argument, a second of compiling
-for the forty arrays of a term; and each call runs through all of it.
+A call from Python would compile code that unpacks every array of every argument, a second of compiling for the forty
+arrays of a term, and every call would run all of it.
 """
 
 import ctypes
@@ -18,9 +18,9 @@ C_TYPES = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.f
 
 
 class NumbaStruct:
-    """A value in memory, for a task to open at `address`. References to arrays are not counted there, but kept here.
+    """A value in memory as compiled code stores it, at `address`. Its arrays are kept here, and not reference-counted.
 
-    Raises TypeError if there is something in it besides numbers, arrays, None, codes, and tuples of these
+    Raises TypeError if the value contains anything but numbers, arrays, None, codes, and tuples of these.
     """
 
     def __init__(self, value: Any):
@@ -31,18 +31,18 @@ class NumbaStruct:
 
 
 class AddressType(types.Type):
-    """Base of types whose values are whole numbers of 64 bits: what `word` of the value says."""
+    """Base of types whose values are 64-bit integers in compiled code: the `address_value` of the Python object."""
 
 
 @cache
 def _struct(fields: tuple[tuple[str, types.Type], ...]) -> type[ctypes.Structure]:
-    """The C struct of named values, each aligned to its own size, as LLVM has it."""
-    return type("Laid", (ctypes.Structure,), {"_fields_": [(name, _c_type(kind)) for name, kind in fields]})
+    """The C struct of named values, each aligned to its own size, like a struct of LLVM."""
+    return type("NumbaTuple", (ctypes.Structure,), {"_fields_": [(name, _c_type(kind)) for name, kind in fields]})
 
 
 def _c_type(kind: types.Type) -> Any:
     if isinstance(kind, types.Array):
-        return _array(kind.ndim)
+        return array_struct(kind.ndim)
     if isinstance(kind, types.BaseTuple):
         return _struct(_fields(kind))
     if isinstance(kind, AddressType):
@@ -50,33 +50,35 @@ def _c_type(kind: types.Type) -> Any:
     if kind is types.none:
         return ctypes.c_void_p
     if kind not in C_TYPES:
-        raise TypeError(f"a value of type {kind} cannot be laid down for compiled code")
+        raise TypeError(f"a value of type {kind} cannot be an argument of a task")
     return C_TYPES[kind]
 
 
 @cache
-def _array(dimensions: int) -> type[ctypes.Structure]:
+def array_struct(dimensions: int) -> type[ctypes.Structure]:
+    """The C struct of an array, with the fields of Numba's `ArrayModel` in the same order."""
     numbers = ctypes.c_ssize_t * dimensions
     owners = [("meminfo", ctypes.c_void_p), ("parent", ctypes.c_void_p)]
-    content = [("size", ctypes.c_ssize_t), ("itemsize", ctypes.c_ssize_t), ("data", ctypes.c_void_p)]
-    fields = [*owners, *content, ("shape", numbers), ("strides", numbers)]
-    return type("LaidArray", (ctypes.Structure,), {"_fields_": fields})
+    content = [("nitems", ctypes.c_ssize_t), ("itemsize", ctypes.c_ssize_t), ("data", ctypes.c_void_p)]
+    return type(
+        "NumbaArray", (ctypes.Structure,), {"_fields_": [*owners, *content, ("shape", numbers), ("strides", numbers)]}
+    )
 
 
 def _fields(kind: types.BaseTuple) -> tuple[tuple[str, types.Type], ...]:
-    return tuple((f"of_{k}", inner) for k, inner in enumerate(kind.types))
+    return tuple((f"item_{k}", inner) for k, inner in enumerate(kind.types))
 
 
 def _fill(struct: ctypes.Structure, fields: tuple[tuple[str, types.Type], ...], values: tuple) -> None:
     """Write values into the fields of a struct."""
     for (name, kind), value in zip(fields, values, strict=True):
         if isinstance(kind, types.Array):
-            there = getattr(struct, name)
-            there.size, there.itemsize, there.data = value.size, value.itemsize, value.ctypes.data
-            there.shape[:], there.strides[:] = value.shape, value.strides
+            array = getattr(struct, name)
+            array.nitems, array.itemsize, array.data = value.size, value.itemsize, value.ctypes.data
+            array.shape[:], array.strides[:] = value.shape, value.strides
         elif isinstance(kind, types.BaseTuple):
             _fill(getattr(struct, name), _fields(kind), value)
         elif isinstance(kind, AddressType):
-            setattr(struct, name, value.word)
+            setattr(struct, name, value.address_value)
         elif kind is not types.none:
             setattr(struct, name, value)

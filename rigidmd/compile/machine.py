@@ -1,4 +1,4 @@
-"""The processor that Numba compiles for, the width of its vectors, its threads, and how finely work is divided."""
+"""The target processor of Numba, the width of its vectors, its threads, and the number of blocks of work."""
 
 import os
 
@@ -8,11 +8,11 @@ from numba.core.registry import cpu_target
 
 from rigidmd.errors import SettingError
 
-#: What Numba compiles for: this machine, or what NUMBA_CPU_NAME and NUMBA_CPU_FEATURES name; as LLVM names it.
+#: LLVM names of the target: this machine, or the one set by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES.
 TRIPLE, PROCESSOR, _FEATURES = cpu_target.target_context.codegen().magic_tuple()
 PROCESSOR_FEATURES = tuple(sorted(name[1:] for name in _FEATURES.split(",") if name.startswith("+")))
 IS_X86 = TRIPLE.startswith("x86_64")
-#: Settings of Numba that change the code it makes, besides those of the processor: environment variable -> value.
+#: Other settings of Numba that change its code: environment variable -> value.
 CODE_SETTINGS = {
     f"NUMBA_{name}": repr(getattr(numba.config, "DEBUGINFO_DEFAULT" if name == "DEBUGINFO" else name, None))
     for name in (
@@ -20,15 +20,16 @@ CODE_SETTINGS = {
         "LLVM_REFPRUNE_PASS", "LLVM_REFPRUNE_FLAGS", "EXTEND_VARIABLE_LIFETIMES", "ENABLE_PROFILING", "DEBUG_NRT",
     )
 }  # fmt: skip
-BLOCKS = 16  # of work, at least, which any thread may take: enough for 16 threads
+BLOCKS = 16  # least number of blocks of work, each run by any thread: enough for 16 threads
 MOST_BLOCKS = 128
-WIDTHS = ("128", "256", "512")  # of vectors, in bits
+WIDTHS = ("128", "256", "512")  # possible widths of vectors, bits
 
 
 def _widest() -> int:
-    """Bits of the widest vectors of the processor that Numba compiles for: those into which LLVM puts 16 integers.
+    """Bits of the widest vectors of the target processor: those that LLVM uses for 16 integers.
 
-    The features that a name implies are not listed, so that LLVM is asked for code: wider intrinsics would abort.
+    Features that a processor name implies are not listed, so the width is read from code that LLVM makes; wider
+    intrinsics would abort the process.
     """
     module = ir.Module()
     vector = ir.VectorType(ir.IntType(32), 16)
@@ -43,7 +44,7 @@ def _widest() -> int:
 
 
 def _simd_bits() -> int:
-    """Bits of the vectors in pair loops: the widest, or what `RIGIDMD_SIMD_BITS` says."""
+    """Bits of the vectors in pair loops: the widest, or the value of `RIGIDMD_SIMD_BITS`."""
     widest, named = _widest(), os.environ.get("RIGIDMD_SIMD_BITS")
     if not named:
         return widest
@@ -56,10 +57,10 @@ def _simd_bits() -> int:
 
 SIMD_BITS = _simd_bits()
 
-#: Threads that there may be: the cores of this process, or what `NUMBA_NUM_THREADS` says.
+#: Largest number of threads: the cores of this process, or the value of `NUMBA_NUM_THREADS`.
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
-def usable_threads(asked: int | None) -> int:
-    """Number of threads that compute when so many are asked for; None: all."""
-    return min(asked or MOST_THREADS, MOST_THREADS)
+def usable_threads(requested: int | None) -> int:
+    """Number of threads that compute for a requested number; None: all."""
+    return min(requested or MOST_THREADS, MOST_THREADS)

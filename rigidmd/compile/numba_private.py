@@ -1,15 +1,15 @@
-"""The private parts of Numba that this package relies on. tests/test_compile.py tests each assumption.
+"""The private parts of Numba on which rigidmd relies. tests/test_compile.py tests each assumption.
 
-- `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and keeps its index in an
-  `IndexDataCacheFile`, whose class may be changed. That loads and saves index and data by the methods that `CacheIndex` has.
+- `FunctionCache` reads its folder from `numba.config.CACHE_DIR` when it is created, and its index is an
+  `IndexDataCacheFile`, whose class may be changed. The methods of `CacheIndex` load and save its index and data.
 - A dispatcher uses `_cache` only when it compiles.
-- `get_call_template` compiles for the types of arguments that it is given.
+- `get_call_template` compiles for the types of its arguments.
 - `no_cpython_wrapper` and `no_cfunc_wrapper` are options of a function: it then has no wrapper for Python.
 - `_nrt` is an option too: if it is False, references are not counted.
-- A `Compiler` creates its library unless its state has one. A library optimises its module and makes machine code of it
-  in `_optimize_final_module` and `_finalize_final_module`. The variables of a module that point to environments have
-  names that begin with `_ZN08NumbaEnv`; Numba sets them in machine code.
-- A `CFunc` compiles for given types, accepts a cache that we set, and calls `_compile_uncached` if that has nothing.
+- A `Compiler` creates its library unless its state has one. A library optimises its module in `_optimize_final_module`
+  and makes machine code in `_finalize_final_module`. The variables of a module that point to environments have names
+  that begin with `_ZN08NumbaEnv`; Numba sets them in machine code.
+- A `CFunc` compiles for given types, accepts another cache, and calls `_compile_uncached` if the cache has no code.
 """
 
 import contextlib
@@ -41,46 +41,46 @@ from rigidmd.errors import RigidMDWarning
 class CacheIndex(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
-    Code for types from outside the package has an index of its own, because no index can be read where one of its types
-    cannot be imported. Such code is kept only if the module of the type is named by its contents (`core.own_code`): of
-    another module nothing tells that it has changed, and old code would go on running.
-    The files of machine code have random names: Numba numbers them, and two processes that compiled at the same time
-    for different types wrote to the same file, after which every run crashed. Every file begins with a checksum; one
-    that is damaged counts as absent, and its code is compiled again. What a folder for all users has is read from
-    there, see `cache.shared_folder`.
+    Code for types from outside the package has a separate index, because an index cannot be read if one of its types
+    cannot be imported. Such code is stored only if the name of the module follows from its source
+    (`core.user_modules`). Changes of other modules are not noticed, so that old code would run.
+    The files of machine code have random names. Numba numbers them, and two processes that compiled at the same time
+    for different types wrote to the same file, after which every run crashed. Every file begins with a checksum; a
+    damaged file is ignored, and its code is compiled again. A folder for all users is also read, see
+    `cache.shared_folder`.
     """
 
     def load(self, key):
-        """A compiled function; None if there is none."""
-        own = self._apart(key)
-        return None if own is None else own._load(key)
+        """A compiled function; None if it is not stored."""
+        index = self._index_for(key)
+        return None if index is None else index._load(key)
 
     def save(self, key, data):
-        """Keep a compiled function."""
-        own = self._apart(key)
-        if own is not None:
-            super(CacheIndex, own).save(key, data)
+        """Store a compiled function."""
+        index = self._index_for(key)
+        if index is not None:
+            super(CacheIndex, index).save(key, data)
 
-    def _apart(self, key) -> "CacheIndex | None":
-        """The index for the types of a key; None if it is not kept."""
-        modules = sorted(set(_foreign(getattr(key[0], "args", key[0]))))
+    def _index_for(self, key) -> "CacheIndex | None":
+        """The index for the types of a key; None if their code is not stored."""
+        modules = sorted(set(_outside_modules(getattr(key[0], "args", key[0]))))
         if not modules:
             return self
         if not all(name.startswith(GENERATED_PREFIX) for name in modules):
             return None
-        there = copy.copy(self)
+        index = copy.copy(self)
         digest = hashlib.sha256(" ".join(modules).encode()).hexdigest()[:16]
-        there._index_path = f"{self._index_path}.{digest}"
-        return there
+        index._index_path = f"{self._index_path}.{digest}"
+        return index
 
     def _load(self, key):
         found = super().load(key)
         shared = shared_folder()
         if found is None and shared is not None:
-            there = copy.copy(self)
-            there._cache_path = self._cache_path.replace(cache_folder(), shared, 1)
-            there._index_path = self._index_path.replace(cache_folder(), shared, 1)
-            found = super(CacheIndex, there).load(key)
+            index = copy.copy(self)
+            index._cache_path = self._cache_path.replace(cache_folder(), shared, 1)
+            index._index_path = self._index_path.replace(cache_folder(), shared, 1)
+            found = super(CacheIndex, index).load(key)
         return found
 
     def _data_name(self, number):
@@ -111,14 +111,14 @@ class CacheIndex(IndexDataCacheFile):
         data = Path(path).read_bytes()
         size = hashlib.sha256().digest_size
         if hashlib.sha256(data[size:]).digest() != data[:size]:
-            fault = f"{path} is damaged; its code is compiled again"
-            warn_once(fault)
-            raise OSError(fault)
+            message = f"{path} is damaged; its code is compiled again"
+            warn_once(message)
+            raise OSError(message)
         return pickle.loads(data[size:])
 
 
-def _foreign(kind) -> Iterator[str]:
-    """Modules outside the package that the named tuples in a Numba type come from."""
+def _outside_modules(kind) -> Iterator[str]:
+    """Modules outside the package that define named tuples in a Numba type."""
     if isinstance(kind, tuple):
         inner = kind
     elif isinstance(kind, types.BaseTuple):
@@ -126,30 +126,30 @@ def _foreign(kind) -> Iterator[str]:
         module = getattr(getattr(kind, "instance_class", tuple), "__module__", "builtins")
         if module.split(".")[0] not in ("rigidmd", "builtins"):
             yield module
-    else:  # of `compile.code`: a parcel, or the tasks of a `Code`
-        inner = (*getattr(kind, "parcels", ()), *([kind.content] if hasattr(kind, "content") else ()))
+    else:  # types of `compile.code`: `CodeType`, `TaskArguments`
+        inner = (*getattr(kind, "task_types", ()), *([kind.content] if hasattr(kind, "content") else ()))
     for part in inner:
-        yield from _foreign(part)
+        yield from _outside_modules(part)
 
 
 @functools.cache
-def warn_once(sentence: str) -> None:
-    """Warn of something, the first time."""
-    warnings.warn(sentence, RigidMDWarning, stacklevel=2)
+def warn_once(message: str) -> None:
+    """Issue a warning the first time."""
+    warnings.warn(message, RigidMDWarning, stacklevel=2)
 
 
-def _of_any_value(kind: types.Type) -> types.Type:
+def _without_literal(kind: types.Type) -> types.Type:
     return types.unliteral(kind) if isinstance(kind, types.IntegerLiteral | types.BooleanLiteral) else kind
 
 
 class KernelDispatcher(CPUDispatcher):
-    """A dispatcher with our own cache, which is opened at the first compilation."""
+    """A dispatcher with the cache of rigidmd, which is opened at the first compilation."""
 
     @property
     def _cache(self):
         found = self.__dict__.get("_opened")
         if found is None:
-            found = self.__dict__["_opened"] = _opened_cache(self.py_func)
+            found = self.__dict__["_opened"] = _open_cache(self.py_func)
         return found
 
     @_cache.setter
@@ -157,16 +157,18 @@ class KernelDispatcher(CPUDispatcher):
         """Ignored: Numba sets a null cache when it creates a dispatcher."""
 
     def get_call_template(self, args, kws):
-        """As Numba's, for numbers of any value: it would compile a function again for each constant argument."""
-        return super().get_call_template(tuple(map(_of_any_value, args)), {k: _of_any_value(v) for k, v in kws.items()})
+        """Like Numba's, but not for each value of a constant argument, for which it would compile a function again."""
+        return super().get_call_template(
+            tuple(map(_without_literal, args)), {k: _without_literal(v) for k, v in kws.items()}
+        )
 
 
 class LinkedLibrary(JITCodeLibrary):
-    """The code of a function that only compiled code calls: it has no machine code of its own.
+    """The code of a function that only compiled code calls, without separate machine code.
 
     Numba optimises the code of every function and makes machine code of it, links it into its callers, and does both
     again there. Here only the outermost function is optimised, with all that it calls: the kernels of water compile
-    in 41 s in place of 49 s.
+    in 41 s instead of 49 s.
     """
 
     def _optimize_functions(self, ll_module):
@@ -175,7 +177,7 @@ class LinkedLibrary(JITCodeLibrary):
             return
         ll_module.data_layout = self._codegen._data_layout
         builder = create_pass_builder(self._codegen._tm, create_pipeline_tuning_options())
-        for function in ll_module.functions:  # of what Numba does here, what makes it smaller
+        for function in ll_module.functions:  # only the passes of Numba that make the code smaller
             passes = FunctionPassManager()
             passes.add_sroa_pass()
             passes.add_dead_code_elimination_pass()
@@ -196,8 +198,7 @@ class LinkedLibrary(JITCodeLibrary):
 
 
 def _has_addresses(module) -> bool:
-    """Whether a module has addresses in this process, with which it cannot be kept. Those that are not used disappear
-    when it is optimised."""
+    """Whether a module has addresses of this process, so that it cannot be stored. Optimising removes unused ones."""
     return any(one.name.startswith("numba.dynamic.globals") for one in module.global_variables)
 
 
@@ -205,7 +206,7 @@ class LinkedCompiler(Compiler):
     """Compiles functions that only compiled code calls."""
 
     def define_pipelines(self):
-        """The passes, after the library is there."""
+        """The passes, after creating the library."""
         self.state.library = LinkedLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         self.state.library.enable_object_caching()
         return super().define_pipelines()
@@ -220,26 +221,26 @@ class InnerKernel(KernelDispatcher):
     """
 
     def __call__(self, *arguments):
-        raise TypeError(f"{self.py_func.__name__} is for compiled code only; for Python, use kernel(outer=True)")
+        raise TypeError(f"{self.py_func.__name__} is for compiled code only; for Python, use kernel(from_python=True)")
 
 
-#: Option of a function that only compiled code calls.
+#: Options of a function that only compiled code calls.
 LINKED_OPTIONS = {"pipeline_class": LinkedCompiler}
 
-#: Held while Numba's setting is another one. Whoever has it waits for no other lock: Numba may hold its own here.
-_setting = threading.Lock()
+#: Held while a setting of Numba is changed. A thread that holds it must not wait for another lock: Numba may hold one.
+_config_lock = threading.Lock()
 
 
-def _opened_cache(function: Callable) -> FunctionCache:
-    with _setting, _own_folder():
+def _open_cache(function: Callable) -> FunctionCache:
+    with _config_lock, _use_cache_folder():
         found = FunctionCache(function)
     found._cache_file.__class__ = CacheIndex
     return found
 
 
 @contextlib.contextmanager
-def _own_folder() -> Iterator[None]:
-    """Set our cache folder for the moment, so that other users of Numba keep theirs."""
+def _use_cache_folder() -> Iterator[None]:
+    """Set the cache folder of rigidmd temporarily, so that other users of Numba keep theirs."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = cache_folder()
     try:
@@ -248,48 +249,48 @@ def _own_folder() -> Iterator[None]:
         numba.config.CACHE_DIR = before
 
 
-def dispatcher(function: Callable, options: dict, outer: bool) -> CPUDispatcher:
-    """A function that is compiled with these options of Numba, or read from our cache, when it is first called.
+def dispatcher(function: Callable, options: dict, from_python: bool) -> CPUDispatcher:
+    """A function that is compiled with these options, or read from the cache, when it is first called.
 
-    outer : whether Python calls it, for which it needs a wrapper. Meanwhile other threads of Python go on
+    from_python : whether Python calls it, for which it needs a wrapper; it then runs without Python's lock
     """
-    options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not outer, "nogil": outer}
-    compiled = numba.njit(**options | ({} if outer else LINKED_OPTIONS))(function)
-    compiled.__class__ = KernelDispatcher if outer else InnerKernel
+    options = options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not from_python, "nogil": from_python}
+    compiled = numba.njit(**options | ({} if from_python else LINKED_OPTIONS))(function)
+    compiled.__class__ = KernelDispatcher if from_python else InnerKernel
     return compiled
 
 
 def compile_callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
-    """A function compiled for these types of arguments, or read from our cache; it is called by address."""
-    code = _not_yet_compiled(function, arguments, options)
+    """A function compiled for these types of arguments, or read from the cache; it is called by address."""
+    code = _callback_of(function, arguments, options)
     code.compile()
     return code
 
 
 def load_callback(function: Callable, arguments: tuple, options: dict) -> CFunc | None:
-    """The same if our cache has it; None if it must be compiled."""
+    """The same, only if the cache has it; None if it must be compiled."""
 
-    class NotKept(Exception):
+    class NotStored(Exception):
         pass
 
     def compile_nothing():
-        raise NotKept
+        raise NotStored
 
-    code = _not_yet_compiled(function, arguments, options)
+    code = _callback_of(function, arguments, options)
     code._compile_uncached = compile_nothing
     try:
         code.compile()
-    except NotKept:
+    except NotStored:
         return None
     return code
 
 
-def _not_yet_compiled(function: Callable, arguments: tuple, options: dict) -> CFunc:
+def _callback_of(function: Callable, arguments: tuple, options: dict) -> CFunc:
     code = CFunc(function, (arguments, types.void), locals={}, options=options)
-    code._cache = _opened_cache(function)
+    code._cache = _open_cache(function)
     return code
 
 
-def reference_counting(counted: bool) -> dict:
+def reference_counting(enabled: bool) -> dict:
     """Options of a function in which references to arrays are counted, or are not."""
-    return {} if counted else {"_nrt": False}
+    return {} if enabled else {"_nrt": False}

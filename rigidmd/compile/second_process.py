@@ -1,8 +1,8 @@
-"""A second process that compiles too: it begins with the last of the tasks that are wanted, this one with the first.
+"""A second process that compiles tasks: it begins with the last one of a list, and the main process with the first.
 
-Python and LLVM compile one function at a time in a process, so a second core helps only a second process. What it has
-compiled is read from the cache. It is started only where several tasks are not in the cache and there is a second core.
-The environment variable `RIGIDMD_COMPILERS` is the number of processes, 1 or 2; without it, 2.
+Python and LLVM compile one function at a time per process, so a second core is useful only to a second process. Its
+code is read from the cache. It is started only if several tasks are not in the cache and there is a second core. The
+environment variable `RIGIDMD_COMPILERS` is the number of processes, 1 or 2; the default is 2.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ from contextvars import ContextVar
 from rigidmd.compile.cache import is_persistent
 from rigidmd.errors import SettingError
 
-#: A helper is started for so many tasks; for fewer, loading the package in a second process takes longer.
+#: Least number of tasks for a helper; for fewer, importing the package in a second process takes longer.
 FEWEST_TASKS = 3
-#: (module of a task, its name there, the type of its parcel)
+#: Module of a task, its name there, and the type of its arguments.
 TaskKey = tuple[str, str, object]
-#: What the helper runs: it finds the package where this process does.
+#: Program of the helper, which finds the package with the same search path.
 HELPER_PROGRAM = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from rigidmd.compile import ahead; ahead.serve()"
+    "from rigidmd.compile import second_process; second_process.compile_requested()"
 )  # fmt: skip
 
 
@@ -39,24 +39,24 @@ def compiler_processes() -> int:
 
 
 class HelperProcess:
-    """A process that compiles tasks, the last of them first."""
+    """A process that compiles tasks, the last one first."""
 
     def __init__(self, wanted: Sequence[TaskKey]):
         content = pickle.dumps(sys.path) + pickle.dumps(list(wanted))
-        self._places = {one: k for k, one in enumerate(wanted)}
+        self._indices = {one: k for k, one in enumerate(wanted)}
         self._begun: set[int] = set()
         self._done: set[int] = set()
-        self._news = threading.Condition()
-        self._over = False
+        self._changed = threading.Condition()
+        self._ended = False
         self._process = subprocess.Popen(
             [sys.executable, "-c", HELPER_PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for this process, which then ends the helper
+            start_new_session=True,  # Ctrl-C goes to this process, which then ends the helper
         )
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended: then there is no help
+        with contextlib.suppress(OSError):  # it has already ended
             self._process.stdin.write(content)
             self._process.stdin.close()
         threading.Thread(target=self._listen, daemon=True).start()
@@ -65,34 +65,33 @@ class HelperProcess:
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for line in lines:
-                word, _, place = line.decode().partition(" ")
-                with self._news:
-                    (self._begun if word == "begun" else self._done).add(int(place))
-                    self._news.notify_all()
-        with self._news:
-            self._over = True
-            self._news.notify_all()
+                event, _, index = line.decode().partition(" ")
+                with self._changed:
+                    (self._begun if event == "begun" else self._done).add(int(index))
+                    self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
     def wait_for(self, one: TaskKey) -> None:
-        """Wait until the helper has compiled a task that it has begun."""
-        place = self._places.get(one)
-        with self._news:
-            while place in self._begun and place not in self._done and not self._over:
-                self._news.wait()
+        """Wait for a task that the helper has begun."""
+        index = self._indices.get(one)
+        with self._changed:
+            while index in self._begun and index not in self._done and not self._ended:
+                self._changed.wait()
 
     def stop(self) -> None:
-        """End the process."""
         self._process.kill()
         self._process.wait()
 
 
-#: The helper of this thread, if there is one.
+#: The helper of this thread, if any.
 _helper: ContextVar[HelperProcess | None] = ContextVar("helper", default=None)
 
 
 @contextlib.contextmanager
 def use_helper(wanted: Sequence[TaskKey]) -> Iterator[None]:
-    """Within it a helper compiles the same tasks; nobody helps if another process cannot be told their types."""
+    """Within the block a helper compiles the same tasks, unless their types cannot be pickled."""
     helper = None
     with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
         helper = HelperProcess(wanted)
@@ -105,19 +104,19 @@ def use_helper(wanted: Sequence[TaskKey]) -> Iterator[None]:
             helper.stop()
 
 
-def wait_for(module: str, name: str, parcel: object) -> None:
-    """Called before a task is compiled here: waits if a helper has begun it."""
+def wait_for(module: str, name: str, arguments_type: object) -> None:
+    """Wait for a task if a helper has begun it; called before it is compiled in this process."""
     helper = _helper.get()
     if helper is not None:
-        helper.wait_for((module, name, parcel))
+        helper.wait_for((module, name, arguments_type))
 
 
 def compile_requested() -> None:
-    """The helper: compile what standard input says, and say so."""
+    """In the helper: compile the tasks listed on standard input, and print the index of each before and after."""
     wanted = pickle.load(sys.stdin.buffer)
-    for place in range(len(wanted) - 1, -1, -1):
-        module, name, parcel = wanted[place]
+    for index in range(len(wanted) - 1, -1, -1):
+        module, name, arguments_type = wanted[index]
         task = getattr(importlib.import_module(module), name)
-        print("begun", place, flush=True)
-        task.address(parcel)
-        print("done", place, flush=True)
+        print("begun", index, flush=True)
+        task.address(arguments_type)
+        print("done", index, flush=True)

@@ -1,4 +1,4 @@
-"""Settings of the process and of Numba. Imported before Numba, which reads them when it is loaded."""
+"""Checks of settings of the process and of Numba. Imported before Numba, which reads them when it is loaded."""
 
 import os
 import warnings
@@ -7,16 +7,16 @@ from rigidmd.core.process import address_space_left, format_gigabytes
 from rigidmd.errors import SettingError
 
 NUMBA_THREAD_LIMIT = 4096
-#: Bytes of addresses that LLVM and SciPy need to be loaded. With less they fail, and OpenBLAS may wait for ever.
+#: Bytes of address space to load LLVM and SciPy. With less they fail, and OpenBLAS may hang.
 LIBRARY_BYTES = 4e8
 
 
 def _check_settings() -> None:
-    """Raise SettingError for a setting with which libraries would stop, compile nothing, or print a traceback."""
+    """Raise SettingError for settings with which libraries would hang, compile nothing, or print a traceback."""
     if (left := address_space_left()) < LIBRARY_BYTES:
         raise SettingError(
-            f"not enough memory: libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and the limit of this process "
-            f"leaves {format_gigabytes(left)}; raise it (ulimit -v)"
+            f"not enough memory: libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and the limit of this "
+            f"process leaves {format_gigabytes(left)}; raise it (ulimit -v)"
         )
     threads = os.environ.get("NUMBA_NUM_THREADS")
     if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= NUMBA_THREAD_LIMIT):
@@ -27,8 +27,8 @@ def _check_settings() -> None:
         warnings.filterwarnings("error", "Environment variable 'NUMBA_", RuntimeWarning)
         try:
             import numba
-        except RuntimeWarning as unread:  # it names the variable between the first two quotes
-            name = str(unread).split("'")[1]
+        except RuntimeWarning as warning:  # names the variable between its first two quotes
+            name = str(warning).split("'")[1]
             raise SettingError(
                 f"{name} is {os.environ[name][:40]!r}, which Numba cannot read: unset it, or give it a value that "
                 "Numba's manual names"

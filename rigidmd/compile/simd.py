@@ -5,7 +5,7 @@ from and stored to contiguous arrays. The number of lanes follows from the machi
 AVX-512, 8 with AVX2, otherwise 4; half as many float64. `simd_types` has the types and operators, this file the
 functions.
 
-Functions that appear in formulas also take scalars, so that one formula serves pair loops and single numbers; so do
+Functions that appear in formulas also accept scalars, so that one formula serves pair loops and single numbers, like
 those of Python's `math`, see `simd_math`.
 """
 
@@ -20,12 +20,12 @@ from numba.extending import intrinsic
 from rigidmd.compile import (
     SIMD_BITS,
     implements,
-    simd_math,  # noqa: F401  (it tells Numba what exp, log, ... of vectors are)
+    simd_math,  # noqa: F401  (registers exp, log, ... of vectors)
 )
 from rigidmd.compile.machine import IS_X86
 from rigidmd.compile.simd_types import LANE_COUNTS, Lanes, Mask, emit_broadcast, multiply_add
 
-#: Whether this machine has the instruction that `permute_two` uses and estimates to 14 bits.
+#: Whether this machine has the instruction of `permute_two`, and estimates of 14 bits.
 HAS_AVX512 = SIMD_BITS == 512
 
 
@@ -35,10 +35,8 @@ def lane_count(dtype) -> int:
 
 
 def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
-    """Like np.zeros, aligned so that no vector lies across two cache lines.
-
-    NumPy aligns to 16 bytes, so a vector of 64 bytes would lie across two lines; that costs the pair loop 3 to 4 %.
-    """
+    """Like np.zeros, aligned to vectors. NumPy aligns to 16 bytes, so that vectors of 64 bytes would cross cache lines,
+    which costs the pair loop 3 to 4 %."""
     shape = (shape,) if isinstance(shape, int) else shape
     size = prod(shape) * np.dtype(dtype).itemsize
     vector = SIMD_BITS // 8
@@ -60,7 +58,7 @@ def _is_contiguous(array) -> bool:
     return isinstance(array, types.Array) and array.layout == "C"
 
 
-def _is_row(array) -> bool:
+def _is_contiguous_1d(array) -> bool:
     return _is_contiguous(array) and array.ndim == 1
 
 
@@ -74,14 +72,14 @@ def _load(lanes, array):
 
 @intrinsic
 def load(typing, array, index):
-    """The vector array[index], array[index + 1], ... of a contiguous array; of several axes the last counts first."""
+    """The vector array[index], array[index + 1], ... of a contiguous array, indexed in C order."""
     return _load(Lanes(array.dtype, LANE_COUNTS[array.dtype]), array) if _is_contiguous(array) else None
 
 
 @intrinsic
 def load_scalar(typing, array, index):
-    """array[index] for an index that is not negative. Numba tests others at each access, inside the pair loop."""
-    if not _is_row(array):
+    """array[index] for an index >= 0, without Numba's test for negative ones at each access in the pair loop."""
+    if not _is_contiguous_1d(array):
         return None
 
     def emit(context, builder, signature, arguments):
@@ -92,28 +90,28 @@ def load_scalar(typing, array, index):
 
 
 @intrinsic
-def load_converted(typing, array, index, other):
-    """`load` with the number of lanes that vectors of another array have."""
+def load_with_lanes_of(typing, array, index, other):
+    """`load` with the number of lanes of vectors of another array."""
     signature, emit = _load(Lanes(array.dtype, LANE_COUNTS[other.dtype]), array)
     return signature.return_type(array, types.intp, other), lambda c, b, s, a: emit(c, b, s, a[:2])
 
 
 @intrinsic
 def load_four(typing, array, index):
-    """Four numbers from array[index] on."""
-    return _load(Lanes(array.dtype, 4), array) if _is_row(array) else None
+    """The vector of four numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 4), array) if _is_contiguous_1d(array) else None
 
 
 @intrinsic
 def load_eight(typing, array, index):
-    """Eight numbers from array[index] on."""
-    return _load(Lanes(array.dtype, 8), array) if _is_row(array) else None
+    """The vector of eight numbers from array[index] on."""
+    return _load(Lanes(array.dtype, 8), array) if _is_contiguous_1d(array) else None
 
 
 @intrinsic
 def load_broadcast(typing, array, index):
     """A vector with array[index] in every lane."""
-    if not _is_row(array):
+    if not _is_contiguous_1d(array):
         return None
     lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
@@ -139,10 +137,10 @@ def store(typing, array, index, lanes):
 
 @intrinsic
 def align_stack(typing):
-    """Align the stack of the calling function to vectors: what registers cannot hold must not lie across cache lines.
+    """Align the stack of the calling function, so that vectors spilled from registers do not cross cache lines.
 
-    LLVM decides whether to align it before it knows that registers will not suffice. Then chance decided, at each start
-    of a process: forces of PME in double precision took between 1.3 and 2.2 ns a lane.
+    LLVM decides whether to align it before it knows which vectors it spills. Without this, the alignment differed
+    between processes: forces of PME in double precision took between 1.3 and 2.2 ns per lane.
     """
 
     def emit(context, builder, signature, arguments):
@@ -158,8 +156,8 @@ def align_stack(typing):
 # --- functions of lanes ----------------------------------------------------------------------------------------------
 
 
-#: What LLVM needs to be told before it replaces a division or a root by the hardware's estimate and a step of Newton's.
-ESTIMATED = ("afn", "arcp", "contract", "nsz", "reassoc")
+#: Flags with which LLVM may replace a division or a root by the hardware's estimate and a Newton step.
+ESTIMATE_FLAGS = ("afn", "arcp", "contract", "nsz", "reassoc")
 
 
 def _call(builder, name, result, *arguments, flags=()):
@@ -169,17 +167,17 @@ def _call(builder, name, result, *arguments, flags=()):
 
 
 def _suffix(kind) -> str:
-    """The name of a vector type in names of LLVM intrinsics."""
+    """A vector type as the suffix of an LLVM intrinsic."""
     element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}.get(kind.element) or f"i{kind.element.width}"
     return f"v{kind.count}{element}"
 
 
 def _square_root(builder, value):
-    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=ESTIMATED)
+    return _call(builder, f"llvm.sqrt.{_suffix(value.type)}", value.type, value, flags=ESTIMATE_FLAGS)
 
 
-def _inverted(builder, value):
-    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATED)
+def _inverse_value(builder, value):
+    return builder.fdiv(ir.Constant(value.type, [1.0] * value.type.count), value, flags=ESTIMATE_FLAGS)
 
 
 @intrinsic
@@ -191,13 +189,15 @@ def square_root(typing, x):
 @intrinsic
 def _approximate_inverse_root(typing, x):
     """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
-    return x(x), lambda context, builder, signature, arguments: _inverted(builder, _square_root(builder, *arguments))
+    return x(x), lambda context, builder, signature, arguments: _inverse_value(
+        builder, _square_root(builder, *arguments)
+    )
 
 
 @intrinsic
 def _approximate_inverse(typing, x):
-    """1/x in float32, in the same way."""
-    return x(x), lambda context, builder, signature, arguments: _inverted(builder, *arguments)
+    """1/x in float32, likewise."""
+    return x(x), lambda context, builder, signature, arguments: _inverse_value(builder, *arguments)
 
 
 def _conversion(dtype):
@@ -225,7 +225,7 @@ QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2
 
 
 def _series_terms(x) -> int:
-    """How many terms of a series correct the estimates of a type; 0 if it has none.
+    """Number of terms of a series that correct the estimates of a type; 0 if it has no estimates.
 
     The next term is below half the last digit: e is at most 1.2e-4 with AVX-512, 7.4e-4 with older instructions.
     """
@@ -235,7 +235,7 @@ def _series_terms(x) -> int:
 
 
 def _fills_avx512(x) -> bool:
-    """Whether a type of vectors fills the registers of AVX-512."""
+    """Whether a vector type fills the registers of AVX-512."""
     return HAS_AVX512 and x.count == LANE_COUNTS.get(x.dtype)
 
 
@@ -262,22 +262,22 @@ def _estimate(name):
     return estimated
 
 
-#: 1/sqrt(x) and 1/x of a vector by the machine's estimates: relative errors up to 2^-14 with AVX-512, else 1.5 2^-12.
-#: That of 1/x is used with AVX-512 only.
+#: 1/sqrt(x) and 1/x of a vector by the estimates of the hardware, with relative errors up to 2^-14 with AVX-512, else
+#: 1.5 2^-12. The second is used with AVX-512 only.
 _root_estimate = intrinsic(_estimate("rsqrt"))
 _quotient_estimate = intrinsic(_estimate("rcp"))
 
 
 @intrinsic
 def _horner(typing, coefficients, x):
-    """Sum of coefficients[k] x^k, by as few operations as there are."""
+    """Sum of coefficients[k] x^k by Horner's rule, with the fewest operations."""
 
     def emit(context, builder, signature, arguments):
         kinds = signature.args[0].types
         found = None
         for k in reversed(range(len(kinds))):
-            own = emit_broadcast(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
-            found = own if found is None else multiply_add(builder, found, arguments[1], own)
+            number = emit_broadcast(context, builder, builder.extract_value(arguments[0], k), kinds[k], x)
+            found = number if found is None else multiply_add(builder, found, arguments[1], number)
         return found
 
     return x(coefficients, x), emit
@@ -288,8 +288,8 @@ def inverse_square_root(x):
     raise TypeError("compiled code only")
 
 
-# The series are written out, since LLVM's own choice depends on the processor: for some it computes a root and divides,
-# for others it corrects an estimate of float32 by one step, and the cube is off by up to 5.8e-7 instead of 1.9e-7.
+# The series are explicit, because LLVM's choice depends on the processor: for some it computes a root and divides, for
+# others it corrects an estimate of float32 by one step, with errors of the cube up to 5.8e-7 instead of 1.9e-7.
 @implements(inverse_square_root, inline=True)
 def _inverse_root(x):
     if not isinstance(x, Lanes):
@@ -319,8 +319,7 @@ def _inverse_root(x):
 def inverse_root_and_cube(x):
     """1/sqrt(x), and two numbers whose product is 1/sqrt(x)³, each accurate to about the last digit.
 
-    The caller multiplies the two in one multiply-add with what is added to the cube. The root costs nothing where it is
-    not used.
+    The caller multiplies the two in a multiply-add. An unused root costs nothing.
     """
     raise TypeError("compiled code only")
 
@@ -328,15 +327,15 @@ def inverse_root_and_cube(x):
 @implements(inverse_root_and_cube, inline=True)
 def _root_and_cube(x):
     if isinstance(x, Lanes) and _series_terms(x):
-        series, of_root = (1.0, *CUBE[: _series_terms(x)]), ROOT[: _series_terms(x)]
+        series, root_series = (1.0, *CUBE[: _series_terms(x)]), ROOT[: _series_terms(x)]
 
         def from_estimate(x):
-            # A corrected root and its cube would take one multiplication more; pairs with a reaction field then take
-            # 5 % longer (AVX-512). The root from the cube would have two rounding errors more, which energies show.
+            # The cube of a corrected root would take one multiplication more; pairs with a reaction field then take 5 %
+            # longer (AVX-512). The root from the cube would have two more rounding errors, visible in energies.
             y = _root_estimate(x)
             y2 = y * y
             e = 1.0 - x * y2
-            return y + y * (e * _horner(of_root, e)), y * y2, _horner(series, e)
+            return y + y * (e * _horner(root_series, e)), y * y2, _horner(series, e)
 
         return from_estimate
 
@@ -354,26 +353,26 @@ def pairwise_minimum(typing, x):
     def emit(context, builder, signature, arguments):
         value, count = arguments[0], x.count
         order = ir.Constant(ir.VectorType(ir.IntType(32), count), [k ^ 1 for k in range(count)])
-        beside = builder.shuffle_vector(value, value, order)
-        return builder.select(builder.fcmp_ordered("<", value, beside), value, beside)
+        neighbor = builder.shuffle_vector(value, value, order)
+        return builder.select(builder.fcmp_ordered("<", value, neighbor), value, neighbor)
 
     return x(x), emit
 
 
 @intrinsic
 def store_even_lanes(typing, array, index, x):
-    """Write the whole parts of lanes 0, 2, 4, ... of a vector, from 0 to 127, to an array of bytes from an index on.
+    """Write the integer parts, 0 to 127, of lanes 0, 2, 4, ... of a vector to an array of bytes from an index on.
 
     Lane 1 must equal lane 0, lane 3 lane 2, and so on.
     """
-    if not _is_row(array) or array.dtype != types.uint8:
+    if not _is_contiguous_1d(array) or array.dtype != types.uint8:
         return None
     count = x.count // 2
 
     def emit(context, builder, signature, arguments):
         target, index, value = arguments
         whole = builder.fptosi(value, ir.VectorType(ir.IntType(32), x.count))
-        # two equal lanes are one number of 64 bits, of which the lowest byte is wanted: no lanes are moved
+        # two equal lanes are one number of 64 bits, whose lowest byte is stored: no lanes are moved
         half = builder.trunc(
             builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)), ir.VectorType(ir.IntType(8), count)
         )
@@ -430,7 +429,7 @@ _smaller = intrinsic(_selection("<"))
 
 
 def maximum(x, y):
-    """The larger of x and y in each lane, y where x is NaN; y may be a scalar."""
+    """The larger of x and y in each lane, y if x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
@@ -442,7 +441,7 @@ def _larger_of_both(x, y):
 
 
 def minimum(x, y):
-    """The smaller of x and y in each lane, y where x is NaN; y may be a scalar."""
+    """The smaller of x and y in each lane, y if x is NaN; y may be a scalar."""
     raise TypeError("compiled code only")
 
 
@@ -511,12 +510,12 @@ def sum_lanes(typing, x):
 
 
 def _shuffle(builder, a, b, lanes):
-    """A vector of these lanes of two others; those of b have the numbers after those of a."""
+    """A vector of these lanes of a and b; lanes of b are numbered after those of a."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes)))
 
 
 def _add_halves(builder, value, count):
-    """The halves of a vector added, again and again until so many lanes are left."""
+    """The halves of a vector added repeatedly until `count` lanes are left."""
     while value.type.count > count:
         half = value.type.count // 2
         value = builder.fadd(*(_shuffle(builder, value, value, range(k, k + half)) for k in (0, half)))
@@ -527,17 +526,17 @@ def _add_halves(builder, value, count):
 def add_lane_sums(typing, array, index, step, x, y):
     """Add the sums of all lanes of vectors x[k] and y[k] to array[index + k step] and array[index + k step + 1].
 
-    x, y : tuples of three vectors. All six are summed together, in the precision of the array, which takes fewer
-    instructions than six times `sum_lanes`.
+    x, y : tuples of three vectors. All six are summed together, in the precision of the array, with fewer instructions
+    than six calls of `sum_lanes`.
     """
-    if not _is_row(array):
+    if not _is_contiguous_1d(array):
         return None
     lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
     three = types.UniTuple(lanes, 3)
-    width, part = lanes.count, 128 // array.dtype.bitwidth  # part: lanes within which a processor shuffles fastest
+    width, part = lanes.count, 128 // array.dtype.bitwidth  # part: number of lanes within which shuffling is fastest
 
     def merged(builder, a, b, first, second):
-        """The sum of two choices of lanes of a and b, the same in each part."""
+        """The sum of two selections of lanes of a and b, the same in each part."""
         both = [[start + k for start in range(0, width, part) for k in lanes] for lanes in (first, second)]
         return builder.fadd(*(_shuffle(builder, a, b, lanes) for lanes in both))
 
@@ -553,10 +552,10 @@ def add_lane_sums(typing, array, index, step, x, y):
             fours = [_add_halves(builder, merged(builder, *of, *halves), 4) for of in ((on_x, on_y), (on_z, on_z))]
             sums = [_shuffle(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
         data = context.make_array(array)(context, builder, into).data
-        for own in sums:
-            there = builder.bitcast(builder.gep(data, [index]), own.type.as_pointer())
+        for pair in sums:
+            address = builder.bitcast(builder.gep(data, [index]), pair.type.as_pointer())
             align = array.dtype.bitwidth // 8
-            builder.store(builder.fadd(builder.load(there, align=align), own), there, align=align)
+            builder.store(builder.fadd(builder.load(address, align=align), pair), address, align=align)
             index = builder.add(index, step)
         return context.get_dummy_value()
 
@@ -604,10 +603,10 @@ def polynomial(typing, coefficients, x):
             return context.cast(builder, number, kinds[k], x)
 
         def chain(powers, y):
-            sum_lanes = constant(powers[-1])
+            total = constant(powers[-1])
             for k in powers[-2::-1]:
-                sum_lanes = multiply_add(builder, sum_lanes, y, constant(k))
-            return sum_lanes
+                total = multiply_add(builder, total, y, constant(k))
+            return total
 
         square = builder.fmul(x_value, x_value)
         even, odd = range(0, len(kinds), 2), range(1, len(kinds), 2)
@@ -621,51 +620,51 @@ def polynomial(typing, coefficients, x):
 
 @intrinsic
 def evaluate_cubic(typing, coefficients, t):
-    """(value, derivative) at t of cubic polynomials, number k of which is valid from t = k to k + 1.
+    """(value, derivative) at t of cubic polynomials, of which number k is valid from t = k to k + 1.
 
-    coefficients (4 n,) : four for each, of x = t - k in ascending order. Before 0 the first goes on in a straight line,
-    beyond the end the last one goes on. t is a float64 or a vector
+    coefficients (4 n,) : four for each polynomial in x = t - k, in ascending order. The first one is extended
+    below 0 by a straight line, the last one beyond the end. t is a float64 or a vector
     """
     lanes = t if isinstance(t, Lanes) else Lanes(types.float64, 1)
     pair = types.UniTuple(t, 2)
 
     def emit(context, builder, signature, arguments):
-        there = context.make_array(coefficients)(context, builder, arguments[0])
+        table = context.make_array(coefficients)(context, builder, arguments[0])
         vector, whole = context.get_value_type(lanes), ir.VectorType(ir.IntType(64), lanes.count)
         value = arguments[1] if isinstance(t, Lanes) else builder.bitcast(arguments[1], vector)
-        last = builder.sub(builder.sdiv(builder.extract_value(there.shape, 0), ir.IntType(64)(4)), ir.IntType(64)(1))
+        last = builder.sub(builder.sdiv(builder.extract_value(table.shape, 0), ir.IntType(64)(4)), ir.IntType(64)(1))
         zero = ir.Constant(vector, [0.0] * lanes.count)
         begins = builder.fcmp_ordered("<", value, zero)
         step = builder.fptosi(builder.select(begins, zero, value), whole)
         parts = [ir.Constant(vector, ir.Undefined)] * 4
         starts = zero
         for k in range(lanes.count):
-            place = ir.IntType(32)(k)
-            index = builder.extract_element(step, place)
+            lane = ir.IntType(32)(k)
+            index = builder.extract_element(step, lane)
             index = builder.select(builder.icmp_signed("<", index, last), index, last)
             index = builder.select(builder.icmp_signed(">", index, ir.IntType(64)(0)), index, ir.IntType(64)(0))
-            starts = builder.insert_element(starts, builder.sitofp(index, vector.element), place)
-            address = builder.gep(there.data, [builder.mul(index, ir.IntType(64)(4))])
+            starts = builder.insert_element(starts, builder.sitofp(index, vector.element), lane)
+            address = builder.gep(table.data, [builder.mul(index, ir.IntType(64)(4))])
             for c in range(4):
                 number = builder.load(builder.gep(address, [ir.IntType(64)(c)]))
                 if number.type != vector.element:
                     number = builder.fptrunc(number, vector.element)
-                parts[c] = builder.insert_element(parts[c], number, place)
+                parts[c] = builder.insert_element(parts[c], number, lane)
         x = builder.fsub(value, starts)
         curved = [builder.select(begins, zero, part) for part in parts[2:]]
 
         def sum_of(*terms):
-            sum_lanes = terms[-1]
+            total = terms[-1]
             for term in terms[-2::-1]:
-                sum_lanes = multiply_add(builder, sum_lanes, x, term)
-            return sum_lanes
+                total = multiply_add(builder, total, x, term)
+            return total
 
         def times(k, part):
             return builder.fmul(ir.Constant(vector, [float(k)] * lanes.count), part)
 
         found = sum_of(*parts[:2], *curved), sum_of(parts[1], times(2, curved[0]), times(3, curved[1]))
         if not isinstance(t, Lanes):
-            found = [builder.extract_element(own, ir.IntType(32)(0)) for own in found]
+            found = [builder.extract_element(one, ir.IntType(32)(0)) for one in found]
         return context.make_tuple(builder, pair, found)
 
     return pair(coefficients, t), emit
@@ -673,7 +672,7 @@ def evaluate_cubic(typing, coefficients, t):
 
 @intrinsic
 def broadcast(typing, number, array):
-    """A vector of an array's type with the same number in every lane."""
+    """A vector of the type of an array with the same number in every lane."""
     lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
     def emit(context, builder, signature, arguments):
@@ -694,7 +693,7 @@ def _width_of(array):
 
 
 def convert_to(x, array):
-    """A vector converted to the precision of an array."""
+    """A vector in the precision of an array."""
     raise TypeError("compiled code only")
 
 
@@ -707,7 +706,7 @@ def _narrowed(x, array):
 
 @intrinsic
 def split_integer_part(typing, x):
-    """(whole, rest) of float32 lanes: integers, rounded towards 0, and x less these; undefined from 2^31 on."""
+    """(integer part, remainder) of float32 lanes, rounded towards 0; undefined from 2^31 on."""
     if not isinstance(x, Lanes) or x.dtype != types.float32:
         return None
     whole = Lanes(types.int32, x.count)
@@ -723,16 +722,16 @@ def split_integer_part(typing, x):
 
 @intrinsic
 def permute_two(typing, low, high, index):
-    """In each lane, one of 32 numbers: 0 to 15 are the lanes of `low`, 16 to 31 those of `high`, all float32.
+    """In each lane, one of 32 float32 numbers: 0 to 15 are the lanes of `low`, 16 to 31 the lanes of `high`.
 
-    Only the last five bits of an index count. This is one instruction of AVX-512, see HAS_AVX512: a table in registers.
+    Only the last five bits of an index count. One instruction of AVX-512, see HAS_AVX512: a table in registers.
     """
     if (low, high, index) != (Lanes(types.float32, 16), Lanes(types.float32, 16), Lanes(types.int32, 16)):
         return None
 
     def emit(context, builder, signature, arguments):
-        first, second, place = arguments
+        first, second, indices = arguments
         name = "llvm.x86.avx512.vpermi2var.ps.512"
-        return _call(builder, name, first.type, first, place, second, flags=())
+        return _call(builder, name, first.type, first, indices, second)
 
     return low(low, high, index), emit

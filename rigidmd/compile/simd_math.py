@@ -1,10 +1,10 @@
 """Functions of mathematics for vectors: math.exp, log, pow, sin, cos, sqrt, fabs, and -x, x**y, abs(x).
 
 A formula written with Python's `math` serves single numbers and vectors alike. In double precision the results are
-accurate to about the last digit, in single precision to 2e-7; x**n with a constant whole n is a product, with the
+accurate to about the last digit, in single precision to 2e-7; x**n with a constant integer n is a product, with the
 rounding error of each factor.
 
-Sums of two parts, one of them the rounding error of the other, must not be reassociated: no kernel has fast-math flags.
+Sums of a number and its rounding error must not be reassociated: no kernel has fast-math flags.
 
 Methods: reduction of the argument by parts of ln 2 and pi/2 (Cody & Waite 1980), the logarithm with s = f/(2 + f) as in
 fdlibm, powers from a logarithm in two doubles (Dekker 1971); polynomials are truncated series.
@@ -26,7 +26,7 @@ from rigidmd.compile.simd_types import Lanes, emit_broadcast
 LN2 = {64: (0.693147180369123816490, 1.90821492927058770002e-10), 32: (0.693359375, -2.12194440e-4)}
 #: pi/2 in three doubles.
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17, -1.4973849048591833e-33)
-#: Arguments of sin and cos beyond this give NaN: the distance between two numbers is a good part of a period.
+#: Arguments of sin and cos beyond this give NaN, because neighbouring numbers differ by a good part of a period.
 LONGEST_ANGLE = 1e13
 
 
@@ -106,7 +106,7 @@ class VectorOperations:
 
 
 def exponential(v: VectorOperations, x, low=None):
-    """exp(x + low), with low a small correction."""
+    """exp(x + low) with a small correction `low`."""
     least, most = (-746.0, 710.0) if v.is_double else (-104.0, 89.0)
     x = v.choose(v.compare("<", x, v.number(least)), v.number(least), x)
     x = v.choose(v.compare(">", x, v.number(most)), v.number(most), x)
@@ -144,7 +144,7 @@ def _odd_series(v: VectorOperations, s2):
 
 
 def _logarithm_limits(v: VectorOperations, x, result):
-    """The logarithm at infinity, at zero and below."""
+    """The logarithm at infinity, at zero and of negative numbers."""
     result = v.choose(v.compare("==", x, v.number(math.inf)), v.number(math.inf), result)
     below = v.choose(v.compare("==", x, v.number(0.0)), v.number(-math.inf), v.number(math.nan))
     return v.choose(v.compare(">", x, v.number(0.0)), result, below)
@@ -161,7 +161,7 @@ def logarithm(v: VectorOperations, x):
     return _logarithm_limits(v, x, v.fma(e, v.number(high), v.sub(f, v.sub(half, inner))))
 
 
-def power(v: VectorOperations, x, y):
+def real_power(v: VectorOperations, x, y):
     """x^y in double precision, for x >= 0; NaN for x < 0."""
     e, f = _mantissa(v, x)
     g = v.add(v.number(2.0), f)
@@ -208,7 +208,7 @@ def _sine(v: VectorOperations, x, quarter: int):
 
 
 def _in_double(builder, lanes: Lanes, emit, *values):
-    """A function of vectors that is computed in double precision whatever their type."""
+    """A function of vectors, computed in double precision for every type."""
     wide = VectorOperations(builder, Lanes(types.float64, lanes.count))
     if wide.bits == lanes.dtype.bitwidth:
         return emit(wide, *values)
@@ -224,7 +224,7 @@ def _absolute(builder, lanes, x):
     return VectorOperations(builder, lanes).call("fabs", x)
 
 
-#: What Python's functions are for vectors: emit(builder, type, value).
+#: Vector versions of Python's functions: emit(builder, type, value).
 FUNCTIONS = {
     math.exp: lambda builder, lanes, x: exponential(VectorOperations(builder, lanes), x),
     math.log: lambda builder, lanes, x: logarithm(VectorOperations(builder, lanes), x),
@@ -253,8 +253,8 @@ for _function, _emit in FUNCTIONS.items():
     _define(_function, _emit)
 
 
-def _whole_power(v: VectorOperations, x, n: int):
-    """x^n by squaring, for a constant integer."""
+def _integer_power(v: VectorOperations, x, n: int):
+    """x^n by squaring, for a constant integer n."""
     if n == 0:
         return v.number(1.0)
     size, square, result = abs(n), x, None
@@ -268,7 +268,7 @@ def _whole_power(v: VectorOperations, x, n: int):
 
 
 class _PowerType(AbstractTemplate):
-    """Types of powers. The constant exponent of x**n keeps its value in its type: whole powers are products."""
+    """Types of powers. A constant exponent n has its value in its type, so that integer powers are products."""
 
     def generic(self, args, kws):
         x, y = args
@@ -283,8 +283,8 @@ def _power(context, builder, signature, arguments):
     lanes, (of_x, of_y) = signature.return_type, signature.args
     x = emit_broadcast(context, builder, arguments[0], of_x, lanes)
     if isinstance(of_y, types.IntegerLiteral):
-        return _whole_power(VectorOperations(builder, lanes), x, of_y.literal_value)
-    return _in_double(builder, lanes, power, x, emit_broadcast(context, builder, arguments[1], of_y, lanes))
+        return _integer_power(VectorOperations(builder, lanes), x, of_y.literal_value)
+    return _in_double(builder, lanes, real_power, x, emit_broadcast(context, builder, arguments[1], of_y, lanes))
 
 
 for _function in (operator.pow, operator.ipow, math.pow):

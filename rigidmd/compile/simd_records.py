@@ -1,7 +1,7 @@
-"""Records in lanes: vectors whose lane n has a number of the n-th of successive records of an array, such as (n, 3).
+"""Transposed loads and stores: lane n of a vector has a number of the n-th of successive records of an array (n, 3).
 
-A square part of the records is loaded as one vector a record and transposed in registers; numbers beside it, where a
-record has more of them than a vector has lanes, one by one.
+A square block of the records is loaded as one vector per record and transposed in registers. The remaining numbers of a
+record are loaded one by one.
 """
 
 from llvmlite import ir
@@ -11,8 +11,8 @@ from numba.extending import intrinsic
 from rigidmd.compile.simd_types import LANE_COUNTS, Lanes
 
 
-def _transposed(builder, rows: list) -> list:
-    """The columns of a square matrix of vectors, which are its rows."""
+def _transpose(builder, rows: list) -> list:
+    """The columns of a square matrix, given its rows as vectors."""
     count, size = len(rows), 1
     while size < count:
         low = [k if not k & size else count + k - size for k in range(count)]
@@ -27,7 +27,7 @@ def _transposed(builder, rows: list) -> list:
     return rows
 
 
-def _places(context, builder, array, value, first, size: int, count: int):
+def _pointers(context, builder, array, value, first, size: int, count: int):
     """Pointers to the numbers of records first ... first + count - 1, [record][number]."""
     data = context.make_array(array)(context, builder, value).data
     start = builder.mul(first, first.type(size))
@@ -46,15 +46,15 @@ def _loader(size: int):
 
         def emit(context, builder, signature, arguments):
             kind = context.get_value_type(lanes)
-            place = _places(context, builder, array, *arguments, size, count)
+            pointers = _pointers(context, builder, array, *arguments, size, count)
             columns, whole = [], size - size % count
             for k in range(0, whole, count):
-                rows = [builder.load(builder.bitcast(own[k], kind.as_pointer()), align=align) for own in place]
-                columns += _transposed(builder, rows)
+                rows = [builder.load(builder.bitcast(record[k], kind.as_pointer()), align=align) for record in pointers]
+                columns += _transpose(builder, rows)
             for k in range(whole, size):
                 column = ir.Constant(kind, ir.Undefined)
                 for n in range(count):
-                    column = builder.insert_element(column, builder.load(place[n][k]), ir.IntType(32)(n))
+                    column = builder.insert_element(column, builder.load(pointers[n][k]), ir.IntType(32)(n))
                 columns.append(column)
             return context.make_tuple(builder, found, columns)
 
@@ -72,15 +72,15 @@ def _storer(size: int):
 
         def emit(context, builder, signature, arguments):
             value, first, given = arguments
-            place = _places(context, builder, array, value, first, size, count)
-            own = [builder.extract_value(given, k) for k in range(size)]
+            pointers = _pointers(context, builder, array, value, first, size, count)
+            vectors = [builder.extract_value(given, k) for k in range(size)]
             whole = size - size % count
             for k in range(0, whole, count):
-                for n, row in enumerate(_transposed(builder, own[k : k + count])):
-                    builder.store(row, builder.bitcast(place[n][k], row.type.as_pointer()), align=align)
+                for n, row in enumerate(_transpose(builder, vectors[k : k + count])):
+                    builder.store(row, builder.bitcast(pointers[n][k], row.type.as_pointer()), align=align)
             for k in range(whole, size):
                 for n in range(count):
-                    builder.store(builder.extract_element(own[k], ir.IntType(32)(n)), place[n][k])
+                    builder.store(builder.extract_element(vectors[k], ir.IntType(32)(n)), pointers[n][k])
             return context.get_dummy_value()
 
         return types.void(array, types.intp, types.UniTuple(lanes, size)), emit

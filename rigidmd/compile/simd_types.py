@@ -1,6 +1,6 @@
-"""The Numba types of SIMD vectors and masks, and their operators; `lanes` has the functions.
+"""The Numba types of SIMD vectors and masks, and their operators; `simd` has the functions.
 
-A value of these types is an LLVM vector. All code is portable LLVM and is compiled to AVX-512, AVX2, SSE or NEON.
+Their values are LLVM vectors. All code is portable LLVM IR and is compiled to AVX-512, AVX2, SSE or NEON.
 """
 
 import operator
@@ -12,7 +12,7 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 
 from rigidmd.compile.machine import SIMD_BITS
 
-#: Lanes of a vector on this machine, by the type of its numbers.
+#: Number of lanes of a vector on this machine, by the type of its numbers.
 LANE_COUNTS = {types.float32: SIMD_BITS // 32, types.float64: SIMD_BITS // 64, types.int32: SIMD_BITS // 32}
 
 
@@ -48,14 +48,14 @@ class MaskModel(models.PrimitiveModel):
 
 
 def _common(a, b) -> Lanes | None:
-    """The vector type of two operands: one is a vector, the other the same type or a scalar; otherwise None."""
+    """The vector type of two operands: a vector, and the same type or a scalar; else None."""
     if isinstance(b, Lanes):
         a, b = b, a
     return a if isinstance(a, Lanes) and (a == b or isinstance(b, types.Number)) else None
 
 
 def emit_broadcast(context, builder, value, kind, lanes):
-    """The value as a vector: itself, or a scalar in every lane."""
+    """A value as a vector; a scalar is copied to every lane."""
     if kind == lanes:
         return value
     number = context.cast(builder, value, kind, lanes.dtype)
@@ -89,8 +89,8 @@ def _operator(functions, emit, result=lambda lanes: lanes):
             lower_builtin(function, *kinds)(lower)
 
 
-# A product and a sum in one expression are one multiply-add, rounded once, chosen here and not by LLVM: what a kernel
-# computes then follows from its source alone, whatever else is compiled into it.
+# A product and a sum in one expression are a multiply-add, rounded once. This is chosen here and not by LLVM, so that
+# the results of a kernel follow from its source alone.
 
 
 def _is_product(value) -> bool:
@@ -98,7 +98,7 @@ def _is_product(value) -> bool:
 
 
 def multiply_add(builder, a, b, c):
-    """a b + c; rounded once on machines that can do so as fast as they multiply."""
+    """a b + c; rounded once on machines that do so as fast as they multiply."""
     kind = ir.FunctionType(c.type, [c.type] * 3)
     element = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}[getattr(c.type, "element", c.type)]
     name = f"v{c.type.count}{element}" if isinstance(c.type, ir.VectorType) else element

@@ -1,15 +1,15 @@
-"""Threads that share the blocks of a task, without OpenMP: they wait inside compiled code, a thread for each core.
+"""A pool of threads that run the blocks of a task, without OpenMP: one per core, waiting inside compiled code.
 
-One thread, the leader, is in the loop over steps; the helpers are Python threads that never leave `_help` and hold no
-lock of Python's. A leader writes down a task, its parcel and the number of blocks, and claims blocks itself; helpers
-that are awake claim blocks too, until there are none. Each thread begins with a share of its own, the same in every
-task, so that what it has computed is still in its core's memory when it is needed; then it helps with what others have
-left. Nobody waits for a helper that has claimed no block: one that sleeps, or whose core is busy with another program,
-is not missed. So a task costs a few exchanges of a line of memory between cores, not an entry into a parallel region
-and a barrier of all threads at its end.
+The calling thread is in the loop over steps. The worker threads are Python threads that never leave `_run_worker` and
+do not hold Python's lock. The calling thread publishes a task, its arguments and the number of blocks, and runs blocks
+itself. Workers that are awake run blocks too, until none is left. Each thread begins with its own work range, which is
+the same in every task, so that data that it has computed are still in the cache of its core; then it continues with
+ranges that other threads have not begun. The calling thread does not wait for workers that have begun no range, for
+example because their core is busy with another program. So a task costs a few transfers of a cache line between cores,
+not the start of a parallel region and a barrier of all threads at its end.
 
-A leader that finds the crew at work, for another leader or because a block has blocks of its own, does all its blocks
-alone. The blocks of a task, not the threads, decide the bits of a result.
+If the pool is busy, with another calling thread or because a block itself has blocks, the calling thread runs all its
+blocks alone. The blocks of a task, not the threads, determine the bits of a result.
 """
 
 import ctypes
@@ -27,31 +27,31 @@ from rigidmd.compile.kernels import compiler_options, kernel
 from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS
 from rigidmd.compile.numba_private import compile_callback, reference_counting
 
-WORD = ir.IntType(64)
-#: Cells of the crew's memory, 8 to a line of cache: cells that different threads write are on lines of their own.
-LEAD, HELPERS, POLLS = 0, 1, 2  # address of `_lead`; helpers that may help; looks of a waiting thread before it sleeps
-AT_WORK = 8  # 1 while a leader has the crew
-JOB = 16  # the number of the present job, even; odd while one is written down
-ADDRESS, PARCEL, BLOCKS = 24, 25, 26  # the job
-DONE = 32  # parts of it that are done
-LEADER_SLEEPS, LEADERS_BELL = 40, 41  # 1 while the leader sleeps; the lock on which it sleeps
-CLAIMED = 48  # for each part of a job the number of the last job in which it was claimed
-PARTS = MOST_BLOCKS  # at most; where there are more blocks, several are a part
-FIRST_HELPER, LINE = CLAIMED + PARTS, 8  # a line for each helper: 1 while it sleeps, and its lock
-SLEEPS, BELL = 0, 1
-SYMBOL = "rigidmd_crew"
+INT64 = ir.IntType(64)
+# Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to different lines.
+RUN_TASK, WORKERS, POLLS = 0, 1, 2  # address of `_run_task`; workers in use; polls of a waiting thread before it sleeps
+BUSY = 8  # 1 while a calling thread uses the pool
+JOB = 16  # even number of the present job; odd while a job is being written
+ADDRESS, ARGUMENTS, BLOCKS = 24, 25, 26  # the job: address of its task, address of its arguments, number of blocks
+DONE = 32  # number of its ranges that are finished
+CALLER_SLEEPS, CALLER_LOCK = 40, 41  # 1 while the calling thread sleeps; the lock on which it sleeps
+RANGE_JOBS = 48  # for each work range, the last job in which a thread began it
+MOST_RANGES = MOST_BLOCKS  # if there are more blocks, a work range has several
+FIRST_WORKER, LINE = RANGE_JOBS + MOST_RANGES, 8  # a cache line for each worker: 1 while it sleeps, and its lock
+SLEEPS, LOCK = 0, 1
+SYMBOL = "rigidmd_thread_pool"
 ALLOCATE, ACQUIRE, RELEASE = "PyThread_allocate_lock", "PyThread_acquire_lock", "PyThread_release_lock"
-#: A thread that waits looks again and again for so long, in seconds, before it sleeps: longer than from one task to the
-#: next, shorter than another program would mind.
-WAIT = 50e-6
+#: Time in seconds for which a waiting thread polls before it sleeps: longer than the time between two tasks, and too
+#: short to disturb other programs.
+POLLING_TIME = 50e-6
 
 
 def _on_cell(emit_on, result=types.int64):
-    """An intrinsic (address of the crew, cell, ...) of whole numbers."""
+    """An intrinsic (address of the pool's memory, cell, ...) of integers."""
 
-    def typed(typing, crew, cell, *values):
+    def typed(typing, pool, cell, *values):
         def emit(context, builder, signature, arguments):
-            at = builder.inttoptr(builder.add(arguments[0], builder.mul(arguments[1], WORD(8))), WORD.as_pointer())
+            at = builder.inttoptr(builder.add(arguments[0], builder.mul(arguments[1], INT64(8))), INT64.as_pointer())
             return emit_on(builder, at, *arguments[2:])
 
         return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
@@ -60,36 +60,36 @@ def _on_cell(emit_on, result=types.int64):
 
 
 @intrinsic
-def _read(typing, crew, cell):
+def _read(typing, pool, cell):
     """The number in a cell."""
-    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8))(typing, crew, cell)
+    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8))(typing, pool, cell)
 
 
 @intrinsic
-def _write(typing, crew, cell, value):
-    """Write a number into a cell; returns the one before."""
-    return _on_cell(lambda b, at, value: b.atomic_rmw("xchg", at, value, "seq_cst"))(typing, crew, cell, value)
+def _write(typing, pool, cell, value):
+    """Write a number into a cell; returns the previous one."""
+    return _on_cell(lambda b, at, value: b.atomic_rmw("xchg", at, value, "seq_cst"))(typing, pool, cell, value)
 
 
 @intrinsic
-def _add(typing, crew, cell, value):
-    """Add a number to that in a cell; returns the one before."""
-    return _on_cell(lambda b, at, value: b.atomic_rmw("add", at, value, "seq_cst"))(typing, crew, cell, value)
+def _add(typing, pool, cell, value):
+    """Add a number to a cell; returns the previous one."""
+    return _on_cell(lambda b, at, value: b.atomic_rmw("add", at, value, "seq_cst"))(typing, pool, cell, value)
 
 
 @intrinsic
-def _replace(typing, crew, cell, old, new):
-    """Write a number into a cell if it holds another, and whether it did."""
+def _replace(typing, pool, cell, old, new):
+    """Replace the number in a cell if it is `old`; returns whether it was."""
 
     def emit(builder, at, old, new):
         return builder.extract_value(builder.cmpxchg(at, old, new, "seq_cst", "seq_cst"), 1)
 
-    return _on_cell(emit, types.boolean)(typing, crew, cell, old, new)
+    return _on_cell(emit, types.boolean)(typing, pool, cell, old, new)
 
 
 @intrinsic
 def _pause(typing):
-    """Leave the core to its other thread for a moment."""
+    """Leave the core to its other hardware thread for a moment."""
 
     def emit(context, builder, signature, arguments):
         if IS_X86:
@@ -100,12 +100,12 @@ def _pause(typing):
     return types.void(), emit
 
 
-def _of_python(name: str, *more: ir.Constant):
-    """An intrinsic (address of a lock) that calls one of Python's functions, which needs no lock of Python's itself."""
+def _python_function(name: str, *more: ir.Constant):
+    """An intrinsic (address of a lock) that calls a C function of Python which does not need Python's lock."""
 
-    def typed(typing, bell):
+    def typed(typing, lock):
         def emit(context, builder, signature, arguments):
-            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [WORD, *(one.type for one in more)])
+            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [INT64, *(one.type for one in more)])
             function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
             builder.call(function, [arguments[0], *more])
             return context.get_dummy_value()
@@ -116,199 +116,201 @@ def _of_python(name: str, *more: ir.Constant):
 
 
 @intrinsic
-def _sleep(typing, bell):
-    """Sleep until the bell is rung, once for each ring."""
-    return _of_python(ACQUIRE, ir.IntType(32)(1))(typing, bell)
+def _sleep(typing, lock):
+    """Sleep until the lock is released, once for each release."""
+    return _python_function(ACQUIRE, ir.IntType(32)(1))(typing, lock)
 
 
 @intrinsic
-def _ring(typing, bell):
-    """Wake the thread that sleeps on a bell."""
-    return _of_python(RELEASE)(typing, bell)
+def _wake(typing, lock):
+    """Wake the thread that sleeps on a lock."""
+    return _python_function(RELEASE)(typing, lock)
 
 
 @intrinsic
-def call_address(typing, address, parcel, block):
-    """Call the task at an address for a parcel, or a `Laid` value, at another."""
+def call_address(typing, address, task_arguments, block):
+    """Call the task at an address with the address of its arguments (a `NumbaStruct` has one) and a block."""
 
     def emit(context, builder, signature, arguments):
-        kind = ir.FunctionType(ir.VoidType(), [WORD, WORD])
+        kind = ir.FunctionType(ir.VoidType(), [INT64, INT64])
         builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
         return context.get_dummy_value()
 
     return types.void(types.intp, types.intp, types.intp), emit
 
 
-@kernel(counted=False)
-def _take(crew, job, address, parcel, blocks, own, threads):
-    """Do what is left of a job, as thread `own` of so many; whether the last part to be done was among it.
+@kernel(count_references=False)
+def _run_ranges(pool, job, address, task_arguments, blocks, thread, threads):
+    """Run the ranges of a job that no thread has begun; returns whether the last one to finish was among them.
 
-    Even threads begin with the first part of their share and go up, odd ones with the last and go down: two threads
-    meet where they have done the same.
+    Even threads begin with their first range and go up, odd ones with their last and go down: two neighbouring threads
+    meet where they have computed the same data.
     """
-    parts = min(blocks, PARTS)
+    ranges = min(blocks, MOST_RANGES)
     last = False
-    up = own % 2 == 0
-    part = own * parts // threads if up else (own + 1) * parts // threads - 1
-    for _ in range(parts):
-        claimed = _read(crew, CLAIMED + part)
-        # A part of an earlier job has this number or a later one: all were claimed before the next job was written.
-        if claimed < job and _replace(crew, CLAIMED + part, claimed, job):
-            for block in range(part * blocks // parts, (part + 1) * blocks // parts):
-                call_address(address, parcel, block)
-            last |= _add(crew, DONE, 1) + 1 == parts
-        part = (part + (1 if up else parts - 1)) % parts
+    up = thread % 2 == 0
+    at = thread * ranges // threads if up else (thread + 1) * ranges // threads - 1
+    for _ in range(ranges):
+        begun = _read(pool, RANGE_JOBS + at)
+        # A range of an earlier job has this number or a later one: all were begun before the next job was written.
+        if begun < job and _replace(pool, RANGE_JOBS + at, begun, job):
+            for block in range(at * blocks // ranges, (at + 1) * blocks // ranges):
+                call_address(address, task_arguments, block)
+            last |= _add(pool, DONE, 1) + 1 == ranges
+        at = (at + (1 if up else ranges - 1)) % ranges
     return last
 
 
-def _help(crew, own):
-    """What helper `own` does, for ever."""
-    line = FIRST_HELPER + LINE * own
-    looks = finished = 0
+def _run_worker(pool, index):
+    """Loop of worker thread `index`; never returns."""
+    line = FIRST_WORKER + LINE * index
+    polls = finished = 0
     while True:
-        job, helpers = _read(crew, JOB), _read(crew, HELPERS)
-        address, parcel, blocks = _read(crew, ADDRESS), _read(crew, PARCEL), _read(crew, BLOCKS)
-        # what was read is of this job if its number is still the same
-        if job != finished and job % 2 == 0 and own < helpers and _read(crew, JOB) == job:
-            if _take(crew, job, address, parcel, blocks, own + 1, helpers + 1) and _replace(crew, LEADER_SLEEPS, 1, 0):
-                _ring(_read(crew, LEADERS_BELL))
+        job, workers = _read(pool, JOB), _read(pool, WORKERS)
+        address, task_arguments, blocks = _read(pool, ADDRESS), _read(pool, ARGUMENTS), _read(pool, BLOCKS)
+        # these values belong to this job if its number is still the same
+        if job != finished and job % 2 == 0 and index < workers and _read(pool, JOB) == job:
+            if _run_ranges(pool, job, address, task_arguments, blocks, index + 1, workers + 1) and _replace(
+                pool, CALLER_SLEEPS, 1, 0
+            ):
+                _wake(_read(pool, CALLER_LOCK))
             finished = job
-            looks = 0
-        elif looks < _read(crew, POLLS):
-            looks += 1
+            polls = 0
+        elif polls < _read(pool, POLLS):
+            polls += 1
             _pause()
         else:
-            looks = 0
-            _write(crew, line + SLEEPS, 1)
-            if _read(crew, JOB) == job or not _replace(crew, line + SLEEPS, 1, 0):
-                _sleep(_read(crew, line + BELL))
+            polls = 0
+            _write(pool, line + SLEEPS, 1)
+            if _read(pool, JOB) == job or not _replace(pool, line + SLEEPS, 1, 0):
+                _sleep(_read(pool, line + LOCK))
 
 
-def _lead(crew, address, parcel, blocks):
-    """Do all blocks of a job, with the crew if it is free."""
-    helpers = _read(crew, HELPERS)
-    if helpers == 0 or not _replace(crew, AT_WORK, 0, 1):
+def _run_task(pool, address, task_arguments, blocks):
+    """Run all blocks of a task, with the workers if the pool is free."""
+    workers = _read(pool, WORKERS)
+    if workers == 0 or not _replace(pool, BUSY, 0, 1):
         for block in range(blocks):
-            call_address(address, parcel, block)
+            call_address(address, task_arguments, block)
         return
-    parts = min(blocks, PARTS)
-    job = (_read(crew, JOB) // 2 + 1) * 2
-    _write(crew, JOB, job - 1)
-    _write(crew, ADDRESS, address)
-    _write(crew, PARCEL, parcel)
-    _write(crew, BLOCKS, blocks)
-    _write(crew, DONE, 0)
-    _write(crew, JOB, job)
-    for own in range(min(helpers, parts - 1)):
-        line = FIRST_HELPER + LINE * own
-        if _read(crew, line + SLEEPS) == 1 and _replace(crew, line + SLEEPS, 1, 0):
-            _ring(_read(crew, line + BELL))
-    _take(crew, job, address, parcel, blocks, 0, helpers + 1)
-    looks = 0
-    while _read(crew, DONE) < parts:
-        looks += 1
-        if looks < _read(crew, POLLS):
+    ranges = min(blocks, MOST_RANGES)
+    job = (_read(pool, JOB) // 2 + 1) * 2
+    _write(pool, JOB, job - 1)
+    _write(pool, ADDRESS, address)
+    _write(pool, ARGUMENTS, task_arguments)
+    _write(pool, BLOCKS, blocks)
+    _write(pool, DONE, 0)
+    _write(pool, JOB, job)
+    for index in range(min(workers, ranges - 1)):
+        line = FIRST_WORKER + LINE * index
+        if _read(pool, line + SLEEPS) == 1 and _replace(pool, line + SLEEPS, 1, 0):
+            _wake(_read(pool, line + LOCK))
+    _run_ranges(pool, job, address, task_arguments, blocks, 0, workers + 1)
+    polls = 0
+    while _read(pool, DONE) < ranges:
+        polls += 1
+        if polls < _read(pool, POLLS):
             _pause()
         else:
-            looks = 0
-            _write(crew, LEADER_SLEEPS, 1)
-            if _read(crew, DONE) < parts or not _replace(crew, LEADER_SLEEPS, 1, 0):
-                _sleep(_read(crew, LEADERS_BELL))
-    _write(crew, AT_WORK, 0)
+            polls = 0
+            _write(pool, CALLER_SLEEPS, 1)
+            if _read(pool, DONE) < ranges or not _replace(pool, CALLER_SLEEPS, 1, 0):
+                _sleep(_read(pool, CALLER_LOCK))
+    _write(pool, BUSY, 0)
 
 
-def _look(crew, looks):
-    """Look as a thread that waits does, so many times."""
-    for _ in range(looks):
-        _read(crew, JOB)
+def _poll(pool, count):
+    """Poll `count` times as a waiting thread does."""
+    for _ in range(count):
+        _read(pool, JOB)
         _pause()
 
 
 @intrinsic
-def run_on_all_threads(typing, address, parcel, blocks):
-    """Call the task at an address for every block of its parcel, on all threads. `start_workers` must have been called."""
+def run_on_all_threads(typing, address, task_arguments, blocks):
+    """Call the task at an address for every block, on all threads. `start_workers` must have been called."""
 
     def emit(context, builder, signature, arguments):
-        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, WORD, SYMBOL)
-        kind = ir.FunctionType(ir.VoidType(), [WORD] * 4)
-        lead = builder.inttoptr(builder.load(memory), kind.as_pointer())
-        parcel = builder.ptrtoint(arguments[1], WORD)
-        builder.call(lead, [builder.ptrtoint(memory, WORD), arguments[0], parcel, arguments[2]])
+        memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, INT64, SYMBOL)
+        kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
+        run_task = builder.inttoptr(builder.load(memory), kind.as_pointer())
+        content = builder.ptrtoint(arguments[1], INT64)
+        builder.call(run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]])
         return context.get_dummy_value()
 
-    return types.void(types.intp, parcel, types.intp), emit
+    return types.void(types.intp, task_arguments, types.intp), emit
 
 
-class _Crew:
-    """The crew of this process: its memory, and the helpers that have been hired."""
+class _ThreadPool:
+    """The thread pool of this process: its memory, and the workers that were started."""
 
     def __init__(self):
-        own = np.zeros(FIRST_HELPER + LINE * (MOST_THREADS + 1), np.int64)
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(own))  # helpers may still look at it while Python ends
-        self.cells = own[-own.ctypes.data % 64 // 8 :]
+        memory = np.zeros(FIRST_WORKER + LINE * (MOST_THREADS + 1), np.int64)
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(memory))  # workers may still read it while Python exits
+        self.cells = memory[-memory.ctypes.data % 64 // 8 :]
         llvmlite.binding.add_symbol(SYMBOL, self.cells.ctypes.data)
         for name in (ACQUIRE, RELEASE):
             llvmlite.binding.add_symbol(name, ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value)
         self.wanted = MOST_THREADS
-        self.hired = 0
+        self.started = 0
         self.code: list = []
-        self._hiring = threading.RLock()
+        self._starting = threading.RLock()
 
-    def start_workers(self) -> None:
-        """Compile what the crew does, or read it from the cache, and hire the helpers that are wanted."""
-        with self._hiring:
+    def start(self) -> None:
+        """Compile the loops of the pool, or read them from the cache, and start the missing workers."""
+        with self._starting:
             if not self.code:
                 options = compiler_options(False) | reference_counting(False)
                 self.code = [
                     compile_callback(function, (types.int64,) * count, options)
-                    for function, count in ((_lead, 4), (_help, 2), (_look, 2))
+                    for function, count in ((_run_task, 4), (_run_worker, 2), (_poll, 2))
                 ]
-                self.cells[LEAD] = self.code[0].address
-                self.cells[LEADERS_BELL] = _bell()
+                self.cells[RUN_TASK] = self.code[0].address
+                self.cells[CALLER_LOCK] = _new_lock()
                 self.cells[POLLS] = self._polls()
-            self.hire()
+            self.start_missing()
 
-    def hire(self) -> None:
-        """Hire the helpers that are missing, and let as many help as are wanted. Does nothing before `start_workers`."""
+    def start_missing(self) -> None:
+        """Start the workers that are missing, and use as many as are wanted. Does nothing before `start`."""
         if not self.code:
             return
-        with self._hiring:
-            helpers = self.wanted - 1
-            for own in range(self.hired, helpers):
-                line = FIRST_HELPER + LINE * own
-                self.cells[line + BELL] = _bell()
-                does, arguments = self._c_function(1), (self.cells.ctypes.data, own)
-                threading.Thread(target=does, args=arguments, name=f"rigidmd-{own + 1}", daemon=True).start()
-                while self.cells[line + SLEEPS] == 0:  # on its way it needs Python's lock, which a run may keep
-                    time.sleep(WAIT)
-                self.hired += 1
-            self.cells[HELPERS] = helpers
+        with self._starting:
+            workers = self.wanted - 1
+            for index in range(self.started, workers):
+                line = FIRST_WORKER + LINE * index
+                self.cells[line + LOCK] = _new_lock()
+                loop, arguments = self._c_function(1), (self.cells.ctypes.data, index)
+                threading.Thread(target=loop, args=arguments, name=f"rigidmd-{index + 1}", daemon=True).start()
+                while self.cells[line + SLEEPS] == 0:  # to start it needs Python's lock, which a run may hold later
+                    time.sleep(POLLING_TIME)
+                self.started += 1
+            self.cells[WORKERS] = workers
 
     def _c_function(self, which: int):
-        """A function with two numbers that runs without Python's lock."""
+        """A function of two integers that runs without Python's lock."""
         return ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)(self.code[which].address)
 
     def _polls(self) -> int:
-        """Looks in the time `WAIT`."""
-        look, count, fastest = self._c_function(2), 500, float("inf")
+        """Number of polls in `POLLING_TIME`."""
+        poll, count, fastest = self._c_function(2), 500, float("inf")
         for _ in range(3):
             began = time.perf_counter()
-            look(self.cells.ctypes.data, count)
+            poll(self.cells.ctypes.data, count)
             fastest = min(fastest, time.perf_counter() - began)
-        return max(1, int(count * WAIT / fastest))
+        return max(1, int(count * POLLING_TIME / fastest))
 
-    def forget(self) -> None:
-        """After a fork: no helper has come along."""
-        self.hired, self._hiring = 0, threading.RLock()
-        self.cells[[HELPERS, AT_WORK, LEADER_SLEEPS]] = 0
-        self.cells[FIRST_HELPER:] = 0
-        self.cells[CLAIMED:FIRST_HELPER] = self.cells[JOB]  # nothing is left of a job that another thread had begun
+    def reset_after_fork(self) -> None:
+        """A child process has no workers."""
+        self.started, self._starting = 0, threading.RLock()
+        self.cells[[WORKERS, BUSY, CALLER_SLEEPS]] = 0
+        self.cells[FIRST_WORKER:] = 0
+        self.cells[RANGE_JOBS:FIRST_WORKER] = self.cells[JOB]  # nothing is left of a job that another thread had begun
         if self.code:
-            self.cells[LEADERS_BELL] = _bell()
+            self.cells[CALLER_LOCK] = _new_lock()
 
 
-def _bell() -> int:
-    """A lock of Python's that is taken: who takes it sleeps until it is released."""
+def _new_lock() -> int:
+    """A lock of Python, acquired: a thread that acquires it again sleeps until it is released."""
     allocate, acquire = getattr(ctypes.pythonapi, ALLOCATE), getattr(ctypes.pythonapi, ACQUIRE)
     allocate.restype, acquire.argtypes = ctypes.c_void_p, (ctypes.c_void_p, ctypes.c_int)
     lock = allocate()
@@ -316,18 +318,18 @@ def _bell() -> int:
     return lock
 
 
-_crew = _Crew()
+_pool = _ThreadPool()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_crew.forget)
+    os.register_at_fork(after_in_child=_pool.reset_after_fork)
 
 
 def start_workers() -> None:
-    """Make the crew ready, at the first call: a leader can then share out blocks."""
-    _crew.begin()
+    """Start the thread pool at the first call; calling threads can then use it."""
+    _pool.start()
 
 
 def set_threads(count: int) -> None:
-    """Let so many threads compute, the leader and its helpers; results do not depend on it."""
-    _crew.wanted = count
-    if count - 1 != _crew.cells[HELPERS]:  # so it is after a fork too
-        _crew.hire()
+    """Number of threads that compute, the calling thread included; results do not depend on it."""
+    _pool.wanted = count
+    if count - 1 != _pool.cells[WORKERS]:  # also true after a fork
+        _pool.start_missing()

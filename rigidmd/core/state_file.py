@@ -2,7 +2,7 @@
 
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def write_state(path: Path, saved: Saved) -> None:
     more = {"residue_number": saved.residue_number, "models": saved.models}
     more = {name: array for name, array in more.items() if array is not None}
     with atomic_file(path) as temporary:
-        arrays = dict(zip(STORED_NAMES, saved.state, strict=True))
+        arrays: dict[str, Any] = dict(zip(STORED_NAMES, saved.state, strict=True))
         names = np.array(saved.names)
         np.savez(temporary, schema=SCHEMA, species_names=names, species=saved.species, **more, **arrays)
 

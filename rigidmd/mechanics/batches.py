@@ -1,6 +1,6 @@
-"""Kinetic energies, kicks, friction with noise and rotations of many bodies at a time.
+"""Kinetic energies, kicks, friction with noise and rotations of several bodies at a time, in SIMD vectors.
 
-Rotations have a body in each lane: with one body at a time, each part of a rotation waits for the one before it.
+In rotations each lane has a body: for a single body, each factor of a rotation would wait for the one before it.
 """
 
 import numpy as np
@@ -10,37 +10,42 @@ from rigidmd.compile.simd import align_stack, broadcast, lane_count, load, mask_
 from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.mechanics.free_rotor import SHORT_ANGLE2, SplitRotor, rotate, rotate_vector, rotation_coefficient_series
 
-LANES = lane_count(np.float64)  # bodies that turn together
-#: Rows of what the lanes have to know of their species: axes a and b (as numbers), h g, h (1/I - g) about a, b and c,
-#: the square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
-AXIS_A, AXIS_B, SHARE, RATE, FASTEST2, TURN, ROWS = 0, 1, 2, 3, 6, 7, 8
+LANES = lane_count(np.float64)  # bodies that are rotated together
+#: Rows of the constants of the species in each lane: axes a and b (as numbers), h g, h (1/I - g) about a, b and c, the
+#: square of the largest of these, and 1 if the axes a, b, c are left-handed, -1 if right-handed.
+AXIS_A, AXIS_B, COMMON, RATE, LARGEST_RATE2, HANDEDNESS, ROWS = 0, 1, 2, 3, 6, 7, 8
 
 
 @kernel
-def kick_group(species, inverse_mass, inverse_inertia, state, acting, first, end, h):
-    """V += h F/m, L += h n_body of molecules first ... end - 1; no momentum gathers on an axis without inertia."""
-    velocity, momentum, force, torque = state.velocity, state.angular_momentum_body, acting.force, acting.torque_body
+def kick_group(species, inverse_mass, inverse_inertia, state, body_load, first, end, h):
+    """V += h F/m, L += h n_body of molecules first ... end - 1; axes without inertia keep their momentum."""
+    velocity, momentum, force, torque = (
+        state.velocity,
+        state.angular_momentum_body,
+        body_load.force,
+        body_load.torque_body,
+    )
     kinds = np.full(LANES, -1)
-    shares, parts = np.empty(3 * LANES), np.empty(3 * LANES)
-    turns = len(momentum) > 0
+    velocity_factors, torque_factors = np.empty(3 * LANES), np.empty(3 * LANES)
+    rotates = len(momentum) > 0
     while first + LANES <= end:
-        if _are_others(kinds, species, first):
+        if _species_changed(kinds, species, first):
             for n in range(3 * LANES):
                 kind = kinds[n // 3]
-                shares[n] = h * inverse_mass[kind]
-                parts[n] = h if inverse_inertia[kind, n % 3] > 0 else 0.0
+                velocity_factors[n] = h * inverse_mass[kind]
+                torque_factors[n] = h if inverse_inertia[kind, n % 3] > 0 else 0.0
         for n in range(0, 3 * LANES, LANES):
             at = 3 * first + n
-            store(velocity, at, load(velocity, at) + load(shares, n) * load(force, at))
-            if turns:
-                before, part = load(momentum, at), load(parts, n)
-                store(momentum, at, select(part == 0.0, before, before + part * load(torque, at)))
+            store(velocity, at, load(velocity, at) + load(velocity_factors, n) * load(force, at))
+            if rotates:
+                before, factor = load(momentum, at), load(torque_factors, n)
+                store(momentum, at, select(factor == 0.0, before, before + factor * load(torque, at)))
         first += LANES
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
             velocity[m, k] += h * inverse_mass[kind] * force[m, k]
-            if turns and inverse_inertia[kind, k] > 0:
+            if rotates and inverse_inertia[kind, k] > 0:
                 momentum[m, k] += h * torque[m, k]
 
 
@@ -49,30 +54,33 @@ def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, 
     """Translational and rotational kinetic energy of molecules first ... end - 1."""
     kinds = np.full(LANES, -1)
     masses, inverses = np.empty(3 * LANES), np.empty(3 * LANES)
-    turns = len(momentum) > 0
+    rotates = len(momentum) > 0
     zero = broadcast(0.0, velocity)
-    moving, turning = (zero, zero, zero), (zero, zero, zero)
+    translation_sums, rotation_sums = (zero, zero, zero), (zero, zero, zero)
     while first + LANES <= end:
-        if _are_others(kinds, species, first):
+        if _species_changed(kinds, species, first):
             for n in range(3 * LANES):
                 masses[n], inverses[n] = mass[kinds[n // 3]], inverse_inertia[kinds[n // 3], n % 3]
-        moving = _with_squares(moving, masses, velocity, 3 * first)
-        if turns:
-            turning = _with_squares(turning, inverses, momentum, 3 * first)
+        translation_sums = _with_squares(translation_sums, masses, velocity, 3 * first)
+        if rotates:
+            rotation_sums = _with_squares(rotation_sums, inverses, momentum, 3 * first)
         first += LANES
-    moved, rotate_vector = sum_lanes(moving[0] + moving[1] + moving[2]), sum_lanes(turning[0] + turning[1] + turning[2])
+    translational, rotational = (
+        sum_lanes(translation_sums[0] + translation_sums[1] + translation_sums[2]),
+        sum_lanes(rotation_sums[0] + rotation_sums[1] + rotation_sums[2]),
+    )
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
-            moved += mass[kind] * velocity[m, k] ** 2
-            if turns:
-                rotate_vector += inverse_inertia[kind, k] * momentum[m, k] ** 2
-    return 0.5 * moved, 0.5 * rotate_vector
+            translational += mass[kind] * velocity[m, k] ** 2
+            if rotates:
+                rotational += inverse_inertia[kind, k] * momentum[m, k] ** 2
+    return 0.5 * translational, 0.5 * rotational
 
 
 @kernel(inline=True)
 def _with_squares(sums, weights, values, at):
-    """Three vectors of sums, with the weighted squares of the values (n, 3) of as many molecules as lanes added."""
+    """Three vectors of sums, with the weighted squares of the values (n, 3) of one molecule per lane added."""
     x, y, z = load(values, at), load(values, at + LANES), load(values, at + 2 * LANES)
     return (
         sums[0] + load(weights, 0) * x * x,
@@ -93,67 +101,67 @@ def scale_group(values, first, end, scale):
 
 
 @kernel
-def apply_langevin_group(model, state, keep, keep_turning, new, numbers, first, end):
+def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, first, end):
     """Friction and noise: v <- keep v + size xi, and so the angular momenta, of molecules first ... end - 1.
 
-    new (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
+    noise (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
     first + m is numbers[k j + m]; three for its velocity, then three for its angular momentum. Returns the kinetic
     energy gained.
     """
     species, velocity, momentum = model.species, state.velocity, state.angular_momentum_body
-    kinds, known = np.full(LANES, -1), np.empty(8 * LANES)
-    turns, apart = len(momentum) > 0, len(numbers) // 6
+    kinds, constants = np.full(LANES, -1), np.empty(8 * LANES)
+    rotates, stride = len(momentum) > 0, len(numbers) // 6
     gained, at = broadcast(0.0, velocity), 0
     while first + LANES <= end:
-        if _are_others(kinds, species, first):
+        if _species_changed(kinds, species, first):
             for n in range(LANES):
                 kind = kinds[n]
                 for k in range(3):
-                    known[k * LANES + n] = new[kind, k]
-                    known[(4 + k) * LANES + n] = model.inverse_inertia[kind, k]
-                known[3 * LANES + n], known[7 * LANES + n] = new[kind, 3], model.mass[kind]
-        size = load(known, 3 * LANES)
+                    constants[k * LANES + n] = noise[kind, k]
+                    constants[(4 + k) * LANES + n] = model.inverse_inertia[kind, k]
+                constants[3 * LANES + n], constants[7 * LANES + n] = noise[kind, 3], model.mass[kind]
+        size = load(constants, 3 * LANES)
         before = load_vectors(velocity, first)
-        after = _stirred(before, keep, (size, size, size), numbers, at, apart)
+        after = _friction_and_noise(before, keep, (size, size, size), numbers, at, stride)
         store_vectors(velocity, first, after)
-        x, y, z = _growth(before, after)
-        gained += load(known, 7 * LANES) * (x + y + z)
-        if turns:
-            sizes = load(known, 0), load(known, LANES), load(known, 2 * LANES)
+        x, y, z = _square_gain(before, after)
+        gained += load(constants, 7 * LANES) * (x + y + z)
+        if rotates:
+            sizes = load(constants, 0), load(constants, LANES), load(constants, 2 * LANES)
             before = load_vectors(momentum, first)
-            after = _stirred(before, keep_turning, sizes, numbers, 3 * apart + at, apart)
+            after = _friction_and_noise(before, keep_momentum, sizes, numbers, 3 * stride + at, stride)
             store_vectors(momentum, first, after)
-            x, y, z = _growth(before, after)
-            gained += load(known, 4 * LANES) * x + load(known, 5 * LANES) * y + load(known, 6 * LANES) * z
+            x, y, z = _square_gain(before, after)
+            gained += load(constants, 4 * LANES) * x + load(constants, 5 * LANES) * y + load(constants, 6 * LANES) * z
         first, at = first + LANES, at + LANES
     heat = sum_lanes(gained)
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
             old = velocity[m, k]
-            velocity[m, k] = keep * old + new[kind, 3] * numbers[apart * k + at]
+            velocity[m, k] = keep * old + noise[kind, 3] * numbers[stride * k + at]
             heat += model.mass[kind] * (velocity[m, k] ** 2 - old * old)
-            if turns:
+            if rotates:
                 old = momentum[m, k]
-                momentum[m, k] = keep_turning * old + new[kind, k] * numbers[apart * (3 + k) + at]
+                momentum[m, k] = keep_momentum * old + noise[kind, k] * numbers[stride * (3 + k) + at]
                 heat += model.inverse_inertia[kind, k] * (momentum[m, k] ** 2 - old * old)
         at += 1
     return 0.5 * heat
 
 
 @kernel(inline=True)
-def _stirred(before, keep, sizes, numbers, at, apart):
-    """Vectors of as many molecules as lanes after friction and noise."""
+def _friction_and_noise(before, keep, sizes, numbers, at, stride):
+    """Vectors of one molecule per lane after friction and noise."""
     return (
         keep * before[0] + sizes[0] * load(numbers, at),
-        keep * before[1] + sizes[1] * load(numbers, at + apart),
-        keep * before[2] + sizes[2] * load(numbers, at + 2 * apart),
+        keep * before[1] + sizes[1] * load(numbers, at + stride),
+        keep * before[2] + sizes[2] * load(numbers, at + 2 * stride),
     )
 
 
 @kernel(inline=True)
-def _growth(before, after):
-    """By how much the square of each component has grown."""
+def _square_gain(before, after):
+    """Increase of the square of each component."""
     return (
         after[0] * after[0] - before[0] * before[0],
         after[1] * after[1] - before[1] * before[1],
@@ -162,50 +170,52 @@ def _growth(before, after):
 
 
 def rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h):
-    """`rotate` of molecules first ... end - 1."""
+    """`free_rotor.rotate` for molecules first ... end - 1."""
     raise TypeError("compiled code only")
 
 
 @implements(rotate_group)
-def _turn_group(rotor, species, rotation, angular_momentum_body, first, end, h):
+def _rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h):
     if not is_a(rotor, SplitRotor):
-        return lambda rotor, species, rotation, angular_momentum_body, first, end, h: _turn_one_by_one(
+        return lambda rotor, species, rotation, angular_momentum_body, first, end, h: _rotate_one_by_one(
             rotor, species, rotation, angular_momentum_body, first, end, h
         )
 
-    def turn_together(rotor, species, rotation, angular_momentum_body, first, end, h):
+    def rotate_together(rotor, species, rotation, angular_momentum_body, first, end, h):
         align_stack()
-        known, kinds = np.empty(ROWS * LANES), np.full(LANES, -1)
+        constants, kinds = np.empty(ROWS * LANES), np.full(LANES, -1)
         whole = (1 << LANES) - 1
         about = (False, False, False)
         while first + LANES <= end:
-            if _are_others(kinds, species, first):
-                about = _learn(known, kinds, rotor, h)
+            if _species_changed(kinds, species, first):
+                about = _set_constants(constants, kinds, rotor, h)
             momentum = load_vectors(angular_momentum_body, first)
             x, y, z = momentum
-            if mask_bits(load(known, FASTEST2 * LANES) * (x * x + y * y + z * z) < SHORT_ANGLE2) != whole:
-                _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + LANES, h)
+            if mask_bits(load(constants, LARGEST_RATE2 * LANES) * (x * x + y * y + z * z) < SHORT_ANGLE2) != whole:
+                _rotate_one_by_one(rotor, species, rotation, angular_momentum_body, first, first + LANES, h)
             elif about[0] | about[1] | about[2]:
-                _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum)
+                _rotate_lanes(constants, about, rotation, angular_momentum_body, first, momentum)
             else:
-                share = load(known, SHARE * LANES)
-                turned_lanes = _about_momenta(load_matrices(rotation, first), (share * x, share * y, share * z), -1.0)
-                store_matrices(rotation, first, turned_lanes)
+                common = load(constants, COMMON * LANES)
+                rotated = _rotate_about_momenta(
+                    load_matrices(rotation, first), (common * x, common * y, common * z), -1.0
+                )
+                store_matrices(rotation, first, rotated)
             first += LANES
-        _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
+        _rotate_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
 
-    return turn_together
+    return rotate_together
 
 
 @kernel
-def _turn_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h):
+def _rotate_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h):
     for m in range(first, end):
         rotate(rotor, species[m], rotation, angular_momentum_body, m, h)
 
 
 @kernel(inline=True)
-def _are_others(kinds, species, first):
-    """Whether the lanes' bodies are of other kinds than before; the kinds become theirs."""
+def _species_changed(kinds, species, first):
+    """Whether the species of the lanes differ from `kinds`, which is then updated."""
     same = True
     for n in range(len(kinds)):
         same &= kinds[n] == species[first + n]
@@ -216,20 +226,22 @@ def _are_others(kinds, species, first):
 
 
 @kernel
-def _learn(known, kinds, rotor, h):
-    """Fill the rows that the lanes have to know; returns about which of the axes a, b, c there are rotations."""
+def _set_constants(constants, kinds, rotor, h):
+    """Fill the rows of constants; returns whether any body rotates about each of the axes a, b, c."""
     about_a = about_b = about_c = False
     for n in range(LANES):
         kind = kinds[n]
         a, b, c = rotor.order[kind, 0], rotor.order[kind, 1], rotor.order[kind, 2]
-        share, rates = h * rotor.common[kind], rotor.excess[kind]
-        known[AXIS_A * LANES + n], known[AXIS_B * LANES + n] = a, b
-        known[SHARE * LANES + n] = share
-        known[RATE * LANES + n] = h * rates[a]
-        known[(RATE + 1) * LANES + n] = h * rates[b]
-        known[(RATE + 2) * LANES + n] = h * rates[c]
-        known[FASTEST2 * LANES + n] = max(abs(share), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
-        known[TURN * LANES + n] = -1.0 if (b - a) % 3 == 1 else 1.0
+        common, rates = h * rotor.common[kind], rotor.excess[kind]
+        constants[AXIS_A * LANES + n], constants[AXIS_B * LANES + n] = a, b
+        constants[COMMON * LANES + n] = common
+        constants[RATE * LANES + n] = h * rates[a]
+        constants[(RATE + 1) * LANES + n] = h * rates[b]
+        constants[(RATE + 2) * LANES + n] = h * rates[c]
+        constants[LARGEST_RATE2 * LANES + n] = (
+            max(abs(common), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
+        )
+        constants[HANDEDNESS * LANES + n] = -1.0 if (b - a) % 3 == 1 else 1.0
         about_a |= rates[a] != 0.0
         about_b |= rates[b] != 0.0
         about_c |= rates[c] != 0.0
@@ -237,43 +249,47 @@ def _learn(known, kinds, rotor, h):
 
 
 @kernel(inline=True)
-def _turn_lanes(known, about, rotation, angular_momentum_body, first, momentum):
-    """`rotor.turn_by_parts` of the bodies in lanes, in the frame of the rotor's axes a, b, c."""
-    a, b, rotate = load(known, AXIS_A * LANES), load(known, AXIS_B * LANES), load(known, TURN * LANES)
+def _rotate_lanes(constants, about, rotation, angular_momentum_body, first, momentum):
+    """`free_rotor.rotate_by_splitting` for one body per lane, in the frame of the rotor's axes a, b, c."""
+    a, b, sign = load(constants, AXIS_A * LANES), load(constants, AXIS_B * LANES), load(constants, HANDEDNESS * LANES)
     axes = (a == 0.0, b == 0.0, a == 1.0, b == 1.0)
     q = load_matrices(rotation, first)
-    L = _in_order(momentum, axes)
-    share = load(known, SHARE * LANES)
-    along = (share * L[0], share * L[1], share * L[2])
-    ordered = _in_order(q[:3], axes) + _in_order(q[3:6], axes) + _in_order(q[6:], axes)
-    q0, q1, q2, q3, q4, q5, q6, q7, q8 = _about_momenta(ordered, along, rotate)
+    L = _to_rotor_axes(momentum, axes)
+    common = load(constants, COMMON * LANES)
+    along = (common * L[0], common * L[1], common * L[2])
+    ordered = _to_rotor_axes(q[:3], axes) + _to_rotor_axes(q[3:6], axes) + _to_rotor_axes(q[6:], axes)
+    q0, q1, q2, q3, q4, q5, q6, q7, q8 = _rotate_about_momenta(ordered, along, sign)
     L0, L1, L2 = L
     if about[0]:
-        angle = 0.5 * load(known, RATE * LANES) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, rotate, L1, L2, q1, q2, q4, q5, q7, q8)
+        angle = 0.5 * load(constants, RATE * LANES) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(angle, sign, L1, L2, q1, q2, q4, q5, q7, q8)
     if about[1]:
-        angle = 0.5 * load(known, (RATE + 1) * LANES) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, rotate, L2, L0, q2, q0, q5, q3, q8, q6)
+        angle = 0.5 * load(constants, (RATE + 1) * LANES) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(angle, sign, L2, L0, q2, q0, q5, q3, q8, q6)
     if about[2]:
-        angle = load(known, (RATE + 2) * LANES) * L2
-        L0, L1, q0, q1, q3, q4, q6, q7 = _about_axis(angle, rotate, L0, L1, q0, q1, q3, q4, q6, q7)
+        angle = load(constants, (RATE + 2) * LANES) * L2
+        L0, L1, q0, q1, q3, q4, q6, q7 = _rotate_about_axis(angle, sign, L0, L1, q0, q1, q3, q4, q6, q7)
     if about[1]:
-        angle = 0.5 * load(known, (RATE + 1) * LANES) * L1
-        L2, L0, q2, q0, q5, q3, q8, q6 = _about_axis(angle, rotate, L2, L0, q2, q0, q5, q3, q8, q6)
+        angle = 0.5 * load(constants, (RATE + 1) * LANES) * L1
+        L2, L0, q2, q0, q5, q3, q8, q6 = _rotate_about_axis(angle, sign, L2, L0, q2, q0, q5, q3, q8, q6)
     if about[0]:
-        angle = 0.5 * load(known, RATE * LANES) * L0
-        L1, L2, q1, q2, q4, q5, q7, q8 = _about_axis(angle, rotate, L1, L2, q1, q2, q4, q5, q7, q8)
-    x, y, z = _in_place((L0, L1, L2), axes)
-    still = load(known, RATE * LANES) == 0.0  # its momentum is kept, with the signs of zeros
-    still = still & (load(known, (RATE + 1) * LANES) == 0.0) & (load(known, (RATE + 2) * LANES) == 0.0)
-    kept = select(still, momentum[0], x), select(still, momentum[1], y), select(still, momentum[2], z)
+        angle = 0.5 * load(constants, RATE * LANES) * L0
+        L1, L2, q1, q2, q4, q5, q7, q8 = _rotate_about_axis(angle, sign, L1, L2, q1, q2, q4, q5, q7, q8)
+    x, y, z = _from_rotor_axes((L0, L1, L2), axes)
+    unchanged = load(constants, RATE * LANES) == 0.0  # its momentum is kept, with the signs of zeros
+    unchanged = unchanged & (load(constants, (RATE + 1) * LANES) == 0.0) & (load(constants, (RATE + 2) * LANES) == 0.0)
+    kept = select(unchanged, momentum[0], x), select(unchanged, momentum[1], y), select(unchanged, momentum[2], z)
     store_vectors(angular_momentum_body, first, kept)
-    back = _in_place((q0, q1, q2), axes) + _in_place((q3, q4, q5), axes) + _in_place((q6, q7, q8), axes)
+    back = (
+        _from_rotor_axes((q0, q1, q2), axes)
+        + _from_rotor_axes((q3, q4, q5), axes)
+        + _from_rotor_axes((q6, q7, q8), axes)
+    )
     store_matrices(rotation, first, back)
 
 
 @kernel(inline=True)
-def _in_order(vector, axes):
+def _to_rotor_axes(vector, axes):
     """Components of a body vector along the rotor's axes a, b, c."""
     x, y, z = vector
     a_is_x, b_is_x, a_is_y, b_is_y = axes
@@ -285,7 +301,7 @@ def _in_order(vector, axes):
 
 
 @kernel(inline=True)
-def _in_place(vector, axes):
+def _from_rotor_axes(vector, axes):
     """A body vector from its components along the rotor's axes a, b, c."""
     a, b, c = vector
     a_is_x, b_is_x, a_is_y, b_is_y = axes
@@ -297,11 +313,11 @@ def _in_place(vector, axes):
 
 
 @kernel(inline=True)
-def _about_momenta(q, along, rotate):
-    """Rows of rotations (nine numbers) after a rotation along a vector: `rotor.turn_along`."""
+def _rotate_about_momenta(q, along, sign):
+    """Rows of rotations (nine numbers) after a rotation along a vector: `free_rotor.rotate_by_vector`."""
     x, y, z = along
     odd, even = rotation_coefficient_series(x * x + y * y + z * z)
-    odd = rotate * odd
+    odd = sign * odd
     return (
         rotate_vector(q[0], q[1], q[2], x, y, z, odd, even)
         + rotate_vector(q[3], q[4], q[5], x, y, z, odd, even)
@@ -310,19 +326,19 @@ def _about_momenta(q, along, rotate):
 
 
 @kernel(inline=True)
-def _about_axis(angle, rotate, La, Lb, a0, b0, a1, b1, a2, b2):
-    """`rotor.about_axis`: the other two components of the momenta, and of each row of the rotations."""
+def _rotate_about_axis(angle, sign, La, Lb, a0, b0, a1, b1, a2, b2):
+    """`free_rotor.rotate_about_axis`: the other two components of the momenta, and of each row of the rotations."""
     odd, even = rotation_coefficient_series(angle * angle)
-    s = rotate * (angle * odd)
+    s = sign * (angle * odd)
     versine = angle * angle * even
     return (
-        _rotated(La, Lb, s, versine)
-        + _rotated(a0, b0, s, versine)
-        + _rotated(a1, b1, s, versine)
-        + _rotated(a2, b2, s, versine)
+        _rotate_pair(La, Lb, s, versine)
+        + _rotate_pair(a0, b0, s, versine)
+        + _rotate_pair(a1, b1, s, versine)
+        + _rotate_pair(a2, b2, s, versine)
     )
 
 
 @kernel(inline=True)
-def _rotated(a, b, s, versine):
+def _rotate_pair(a, b, s, versine):
     return a - (s * b + versine * a), b + (s * a - versine * b)

@@ -1,6 +1,6 @@
 """Free-rotor flows: the rotation of a body without torque.
 
-A rotor is a term: `rotate(rotor, ...)` is chosen by its type at compile time, so a scene of points compiles no rotation.
+The kernel `rotate(rotor, ...)` is chosen by the type at compile time, so a scene of points compiles no rotation.
 """
 
 from math import cos, inf, nan, sin, sqrt
@@ -28,7 +28,7 @@ class SplitRotor(NamedTuple):
     for g = 1/I_c (the symmetric and asymmetric part of Dullweber et al.), it is less than 1/6 for each of 1,000 random
     bodies, and 1/19 for most.
 
-    The flow of bodies with two equal moments is exact: A = C = 0. For a linear or spherical body only g remains.
+    The flow of bodies with two equal moments is exact: A = C = 0. For linear and spherical bodies only g remains.
     """
 
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
@@ -47,7 +47,7 @@ class ExactRotor(NamedTuple):
     rotation by 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are divided into parts.
     """
 
-    inverse_inertia: np.ndarray  # these five as in SplitRotor
+    inverse_inertia: np.ndarray  # all five as in SplitRotor
     symmetry: np.ndarray
     common: np.ndarray
     excess: np.ndarray
@@ -56,10 +56,10 @@ class ExactRotor(NamedTuple):
 
 NO_SYMMETRY, SPHERICAL = -1, 3  # of SplitRotor.symmetry
 MOST_TERMS = 30
-#: rad in one drift. A body that gains energy without bound would otherwise be rotated in parts for hours; its momentum
-#: is set to NaN, which stops the run.
+#: Largest rotation in one drift, rad. Beyond it the momentum is set to NaN, which stops the run; a body whose energy
+#: diverges would otherwise be rotated in parts for hours.
 LARGEST_ANGLE = 1e4
-SHORT_ANGLE2 = 0.0625  # square of an angle, rad²
+SHORT_ANGLE2 = 0.0625  # rad², below which series are used
 LONGEST_PART = 0.5  # rad; 0.3 rad takes 14 terms, 1 rad 26
 
 
@@ -74,7 +74,7 @@ def split_rotor(inertia: np.ndarray) -> SplitRotor:
 
 
 def _parts(inverse: np.ndarray) -> tuple[float, tuple[int, int, int]]:
-    """g and the axes a, b, c of SplitRotor; for a symmetric body the axis of symmetry is last, with one rotation."""
+    """g and the axes a, b, c of SplitRotor; a symmetric body rotates once about its axis of symmetry, c."""
     low, middle, high = np.argsort(inverse)
     far, near = (high, low) if inverse[middle] - inverse[low] < inverse[high] - inverse[middle] else (low, high)
     beyond = inverse[middle] - inverse[near]
@@ -88,12 +88,12 @@ def _symmetry(moments: np.ndarray) -> int:
 
 
 class DrivenRotor(NamedTuple):
-    """A single body with rotors (wheels) or a changing inertia: L = I(t) omega + h(t), with fixed principal axes.
+    """A single body with wheels or a changing inertia: L = I(t) omega + h(t), with fixed principal axes.
 
-    h is the angular momentum of all rotors relative to the lab, along the body's axes. L' = L x omega + n then includes
-    the terms -h' and -I' omega of Euler's equations, and H = sum (L_k - h_k)²/(2 I_k) still splits into exact plane
-    rotations. I and h are taken at the middle of each time interval. The changes of H with I and h are computed exactly
-    and counted as work done on the body.
+    h is the angular momentum of all wheels relative to the lab, along the body's axes. L' = L x omega + n includes the
+    terms -h' and -I' omega of Euler's equations, and H = sum (L_k - h_k)²/(2 I_k) still splits into exact rotations
+    about axes. I and h are evaluated at the middle of each time interval. The changes of H with I and h are computed
+    exactly and counted as work done on the body.
     """
 
     inertia: TimeFunction
@@ -112,27 +112,27 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 
 
 @implements(rotate, NoRotor, inline=True)
-def _turn_points(rotor, species, rotation, angular_momentum_body, m, h):
+def _rotate_points(rotor, species, rotation, angular_momentum_body, m, h):
     return None
 
 
 @implements(rotate, inline=True)
-def _turn_body(rotor, species, rotation, angular_momentum_body, m, h):
+def _rotate_by_type(rotor, species, rotation, angular_momentum_body, m, h):
     if is_a(rotor, SplitRotor):
 
-        def turn_split(rotor, species, rotation, angular_momentum_body, m, h):
+        def rotate_split(rotor, species, rotation, angular_momentum_body, m, h):
             rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
 
-        return turn_split
+        return rotate_split
     if is_a(rotor, ExactRotor):
 
-        def turn_exact(rotor, species, rotation, angular_momentum_body, m, h):
+        def rotate_exact(rotor, species, rotation, angular_momentum_body, m, h):
             if rotor.symmetry[species] == NO_SYMMETRY:
                 rotate_by_series(rotation, angular_momentum_body, m, rotor.inverse_inertia[species], h)
             else:
                 rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
 
-        return turn_exact
+        return rotate_exact
 
 
 @kernel(inline=True)
@@ -181,15 +181,15 @@ def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
                 q1 += p0 * v0 + p2 * v2 - p3 * v1
                 q2 += p0 * v1 + p3 * v0 - p1 * v2
                 q3 += p0 * v2 + p1 * v1 - p2 * v0
-            share = 1 / (k + 1)
-            terms[k + 1, 0] = a0 * share * g0
-            terms[k + 1, 1] = a1 * share * g1
-            terms[k + 1, 2] = a2 * share * g2
-            share *= 0.5 * part
-            q0 *= share
-            q1 *= share
-            q2 *= share
-            q3 *= share
+            factor = 1 / (k + 1)
+            terms[k + 1, 0] = a0 * factor * g0
+            terms[k + 1, 1] = a1 * factor * g1
+            terms[k + 1, 2] = a2 * factor * g2
+            factor *= 0.5 * part
+            q0 *= factor
+            q1 *= factor
+            q2 *= factor
+            q3 *= factor
             terms[k + 1, 3] = q0
             terms[k + 1, 4] = q1
             terms[k + 1, 5] = q2
@@ -206,11 +206,11 @@ def rotate_by_series(rotation, angular_momentum_body, m, inverse, h):
 @kernel(inline=True)
 def apply_quaternion(rotation, angular_momentum_body, m, w, x, y, z):
     """Q <- Q R, L <- R^T L with R the rotation of the quaternion (1 + w, x, y, z), of any length."""
-    share = 2 / ((1 + w) * (1 + w) + x * x + y * y + z * z)
-    c = share * (1 + w)
+    scale = 2 / ((1 + w) * (1 + w) + x * x + y * y + z * z)
+    c = scale * (1 + w)
     L = angular_momentum_body[m]
-    L[0], L[1], L[2] = rotate_vector(L[0], L[1], L[2], x, y, z, -c, share)
-    rotate_rows(rotation[m], x, y, z, -c, share)
+    L[0], L[1], L[2] = rotate_vector(L[0], L[1], L[2], x, y, z, -c, scale)
+    rotate_rows(rotation[m], x, y, z, -c, scale)
 
 
 @kernel(inline=True)
@@ -228,7 +228,7 @@ def rotate_vector(a, b, d, x, y, z, first, second):
 
 @kernel(inline=True)
 def rotate_rows(rotation, x, y, z, first, second):
-    """`rotate_vector` of each row of Q (3, 3), in place: a row of Q R is R^T times the row of Q."""
+    """`rotate_vector` on each row of Q (3, 3), in place: a row of Q R is R^T times the row of Q."""
     for row in range(3):
         rotation[row, 0], rotation[row, 1], rotation[row, 2] = rotate_vector(
             rotation[row, 0], rotation[row, 1], rotation[row, 2], x, y, z, first, second
@@ -237,10 +237,7 @@ def rotate_rows(rotation, x, y, z, first, second):
 
 @kernel(inline=True)
 def rotate_about_axes(rotation, angular_momentum_body, m, order, rate, offset, h):
-    """Five exact rotations about the axes in this order, by angles h rate (L_k - offset).
-
-    The offset of a gyrostat is the momentum of its rotors.
-    """
+    """Five exact rotations about the axes `order`, by angles h rate (L_k - offset); offset: momentum of wheels."""
     L = angular_momentum_body
     a, b, c = order
     rotate_about_axis(rotation, L, m, a, 0.5 * h * rate[0] * (L[m, a] - offset[0]))
@@ -272,8 +269,8 @@ def rotate_about_axis(rotation, angular_momentum_body, m, k, angle):
 def sine_and_versine(angle):
     """sin and 1 - cos of an angle, for rotations that are written as a change.
 
-    cos² + sin² is 1 only to rounding, and a rotation by the same angle would repeat the same error at every step.
-    Written as a change, the error is smaller by the angle squared, and only the sum rounds, differently each time.
+    cos² + sin² is 1 only to rounding, so a rotation by the same angle would repeat the same error at every step.
+    Written as a change, the error is smaller by the angle squared, and only the sum is rounded, differently each time.
     """
     odd, even = rotation_coefficients(angle * angle)
     return angle * odd, angle * angle * even
@@ -292,7 +289,7 @@ def rotation_coefficients(x):
 
 @kernel(inline=True)
 def rotation_coefficient_series(x):
-    """`rotation_coefficients` by Taylor series: accurate to rounding below SHORT, and faster than sin and cos of the library."""
+    """`rotation_coefficients` by Taylor series, accurate to rounding below SHORT_ANGLE2 and faster than sin and cos."""
     x2 = x * x
     odd = (1 - 1 / 6 * x) + x2 * (
         (1 / 120 - 1 / 5040 * x) + x2 * ((1 / 362880 - 1 / 39916800 * x) + 1 / 6227020800 * x2)
@@ -304,15 +301,15 @@ def rotation_coefficient_series(x):
 
 
 @kernel(inline=True)
-def rotate_about_momentum(rotation, angular_momentum_body, m, share):
-    """Rotate about L by the angle share |L|: L is constant, Q <- Q R(share L)."""
+def rotate_about_momentum(rotation, angular_momentum_body, m, rate):
+    """Rotate about L by the angle rate |L|: L is constant, Q <- Q R(rate L)."""
     L = angular_momentum_body[m]
-    rotate_by_vector(rotation[m], share * L[0], share * L[1], share * L[2])
+    rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
 
 
 @kernel(inline=True)
 def rotate_by_vector(rotation, x, y, z):
-    """Q <- Q R with the rotation vector (x, y, z) of R, body frame. It avoids the length, which is a third faster."""
+    """Q <- Q R with the rotation vector (x, y, z) of R, body frame; its length is not needed, which saves a third."""
     odd, even = rotation_coefficients(x * x + y * y + z * z)
     rotate_rows(rotation, x, y, z, -odd, even)
 
@@ -323,11 +320,11 @@ def rotate_body(rotor, state, time, h):
 
 
 @implements(rotate_body, inline=True)
-def _turn_alone(rotor, state, time, h):
+def _rotate_body(rotor, state, time, h):
     if not is_a(rotor, DrivenRotor):
         return lambda rotor, state, time, h: rotate(rotor, 0, state.rotation, state.angular_momentum_body, 0, h)
 
-    def turn_driven(rotor, state, time, h):
+    def rotate_driven(rotor, state, time, h):
         L = state.angular_momentum_body
         before = driven_energy(rotor, L, time)
         middle = time + 0.5 * h
@@ -341,7 +338,7 @@ def _turn_alone(rotor, state, time, h):
         rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
         state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
 
-    return turn_driven
+    return rotate_driven
 
 
 @kernel
@@ -349,8 +346,8 @@ def driven_energy(rotor, angular_momentum_body, time):
     """sum (L_k - h_k)²/(2 I_k) at a time."""
     energy = 0.0
     for k in range(3):
-        own = angular_momentum_body[0, k] - value(rotor.momentum, time, k)
-        energy += 0.5 * own * own / value(rotor.inertia, time, k)
+        L = angular_momentum_body[0, k] - value(rotor.momentum, time, k)
+        energy += 0.5 * L * L / value(rotor.inertia, time, k)
     return energy
 
 

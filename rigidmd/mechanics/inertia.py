@@ -1,4 +1,4 @@
-"""Inertia of a set of point masses: tensor, principal frame, kind of body."""
+"""Inertia of point masses: tensor, principal frame, kind of body."""
 
 from typing import Literal, NamedTuple
 
@@ -28,15 +28,14 @@ class PrincipalFrame(NamedTuple):
 
 def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Inertia tensor (3, 3) about the origin of masses (s,) at positions (s, 3)."""
-    return np.einsum("s,sk,sk->", masses, positions, positions) * np.eye(3) - np.einsum(
-        "s,si,sj->ij", masses, positions, positions
-    )
+    squares = np.einsum("s,sk,sk->", masses, positions, positions)
+    return squares * np.eye(3) - np.einsum("s,si,sj->ij", masses, positions, positions)
 
 
 def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.ndarray:
-    """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, from that about it (parallel axes).
+    """Inertia tensor (3, 3) about a point at `offset` (3,) from the centre of mass, by the parallel axis theorem.
 
-    A negative mass gives the inverse.
+    tensor (3, 3) : about the centre of mass. A negative mass gives the inverse
     """
     return tensor + inertia_tensor(np.array([mass]), np.array([offset], dtype=float))
 

@@ -1,7 +1,7 @@
-"""The attitude as variables of a first-order system of ODEs, in the three forms of the textbooks.
+"""The attitude as variables of a first-order system of ODEs: rotation matrix, quaternion or Euler angles.
 
-The attitude variables come first in y. Their rates follow from the angular velocity, body axes, relative to the frame
-of reference. Each form is a term, chosen by its type.
+The attitude variables come first in y. Their rates follow from the angular velocity relative to the frame of reference,
+along the body's axes. Kernels are chosen by the type of the form.
 """
 
 from math import cos, sin
@@ -48,7 +48,7 @@ def variables_of(form: Form, rotation: np.ndarray) -> np.ndarray:
 
 
 def read_attitude(form, y, rotation):
-    """Write Q (1, 3, 3) of the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
+    """Write Q (1, 3, 3) from the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
     raise TypeError("compiled code only")
 
 

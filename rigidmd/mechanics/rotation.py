@@ -1,7 +1,7 @@
-"""Rotation matrices Q (body to lab, x_lab = Q x_body) and stacks of them, in NumPy; not performance critical.
+"""Rotation matrices Q (body to lab, x_lab = Q x_body) in NumPy, for code that is not performance critical.
 
-Also other descriptions of Q: quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence 3-1-3, yaw, pitch
-and roll in the sequence 3-2-1, attitude matrices. Angles are in rad.
+Conversions from and to quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence 3-1-3, yaw, pitch
+and roll in the sequence 3-2-1, and attitude matrices. Angles are in rad.
 """
 
 import numpy as np
@@ -17,12 +17,13 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     """Q (..., 3, 3) of quaternions (..., 4) in order w, x, y, z, which are normalised; the length must not be 0."""
     q = np.asarray(quaternion_wxyz, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrix(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def unit_vector(vector: ArrayLike) -> np.ndarray:
@@ -178,7 +179,7 @@ def orthogonality_error(rotation: np.ndarray) -> float:
     """
     if len(rotation) == 0:
         return 0.0
-    # entry by entry over the whole stack: NumPy multiplies many small matrices seven times as slowly
+    # entry by entry over the stack, because NumPy is seven times as slow for products of many small matrices
     columns = rotation.reshape(-1, 9).T.copy().reshape(3, 3, -1)
     entries = ((j, k) for j in range(3) for k in range(j, 3))
     return max(float(np.abs((columns[:, j] * columns[:, k]).sum(axis=0) - (j == k)).max()) for j, k in entries)
@@ -197,7 +198,7 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
 
 
 def _matrix(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Matrices (..., m, n) of m rows of n entries (...)."""
+    """Matrices (..., m, n) from m rows of n entries (...)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

@@ -1,6 +1,6 @@
 """Homogeneous solids by name: principal moments, an outline to draw, and the added mass of an ellipsoid in a fluid.
 
-Every solid is one of unit size, stretched along the axes 1, 2, 3 of its principal frame. Axis 3 is the axis of
+Every solid is a shape of unit size, scaled along the axes 1, 2, 3 of its principal frame. Axis 3 is the axis of
 symmetry, and the origin is the centre of mass. Any consistent units may be used.
 """
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 
 class Solid(NamedTuple):
-    """A homogeneous solid: principal moments `inertia` (3,), and an `outline` (k, 3) of points to draw, body frame."""
+    """A homogeneous solid: principal moments `inertia` (3,) and points `outline` (k, 3) to draw, body frame."""
 
     inertia: np.ndarray
     outline: np.ndarray
@@ -22,7 +22,7 @@ class Solid(NamedTuple):
 class Shape(NamedTuple):
     """A kind of solid with all dimensions equal to 1.
 
-    dimensions: the axes (0, 1, 2) that each dimension stretches, by the name of the dimension in a scene; the solid is
+    dimensions: the axes (0, 1, 2) that each dimension scales, by the name of the dimension in a scene; the solid is
     thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²> over its mass. outline (k, 3): points on
     its surface.
     """
@@ -32,7 +32,7 @@ class Shape(NamedTuple):
     outline: np.ndarray
 
 
-#: How many numbers each dimension has.
+#: Number of components of each dimension.
 COMPONENTS_PER_DIMENSION = {"radius_m": 1, "height_m": 1, "length_m": 1, "lengths_m": 3, "semi_axes_m": 3}
 
 
@@ -49,7 +49,7 @@ def _outline(*rings: tuple[int, float, float]) -> np.ndarray:
 
 _BALL = _outline((1, 0, -1), (8, 0.5**0.5, -(0.5**0.5)), (8, 1, 0), (8, 0.5**0.5, 0.5**0.5), (1, 0, 1))
 
-#: Every shape by its name. A cone points down: its tip is at z = -3/4 height, so that a top stands on it.
+#: Shapes by name. A cone points down, with its tip at z = -3/4 height, so that a top stands on it.
 SOLIDS = {
     "cylinder": Shape(
         {"radius_m": [0, 1], "height_m": [2]},
@@ -78,14 +78,14 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
     """The homogeneous solid of this mass.
 
     shape : a key of SOLIDS
-    dimensions : all dimensions of that shape, each with as many numbers as NUMBERS says
+    dimensions : all dimensions of that shape, each with COMPONENTS_PER_DIMENSION numbers
     """
     unit = SOLIDS[shape]
-    stretch = np.zeros(3)
+    scale = np.zeros(3)
     for name, axes in unit.dimensions.items():
-        stretch[axes] = dimensions[name]
-    spread = mass * stretch**2 * unit.mean_squares
-    return Solid(spread[[1, 2, 0]] + spread[[2, 0, 1]], unit.outline * stretch)
+        scale[axes] = dimensions[name]
+    spread = mass * scale**2 * unit.mean_squares
+    return Solid(spread[[1, 2, 0]] + spread[[2, 0, 1]], unit.outline * scale)
 
 
 def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.nd
     gamma - beta = (b² - c²) near and 2 (b² - c²) + (b² + c²) (beta - gamma) = (b² - c²) (alpha + 2 far), so that
     (b² - c²)² near / (alpha + 2 far) is not 0/0 for equal axes, and has no cancellation for nearly equal ones.
     """
-    from scipy.special import elliprd  # other solids do not need SciPy
+    from scipy.special import elliprd  # slow to import, and other solids do not need it
 
     axes = np.asarray(semi_axes, dtype=float)
     following, last = axes[[1, 2, 0]], axes[[2, 0, 1]]

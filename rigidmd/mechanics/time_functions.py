@@ -1,4 +1,4 @@
-"""Courses: vectors as given functions of time (a motor's torque, a changing inertia, a frame that spins up)."""
+"""Vectors as given functions of time, such as the torque of a motor, a changing inertia or a frame that spins up."""
 
 from math import inf
 from typing import NamedTuple
@@ -13,7 +13,7 @@ class TimeFunction(NamedTuple):
 
     Piece i, from times[i] to times[i + 1], is constant[i] + d slope[i] + d² curvature[i] with d = t - times[i]. The
     first piece begins at time 0, like every run; the last has no end. Compiled code gets one piece at a time
-    (`piece_at`): a run is stepped from break to break, so that no step contains a jump or a kink.
+    (`piece_at`), and a run stops at every break, so that no step contains a jump or a kink.
     """
 
     times: np.ndarray  # (k,) increasing, the first 0
@@ -45,66 +45,66 @@ def pulse_function(vector, begin: float, end: float) -> TimeFunction:
     return TimeFunction(times, values, np.zeros_like(values), np.zeros_like(values))
 
 
-def integrate_function(course: TimeFunction, start) -> TimeFunction:
-    """start (3,) plus the integral from time 0 of a course with constant and linear pieces."""
-    constant = np.empty_like(course.constant)
+def integrate_function(function: TimeFunction, start) -> TimeFunction:
+    """start (3,) plus the integral from time 0 of a function without curvature."""
+    constant = np.empty_like(function.constant)
     constant[0] = start
-    for i, length in enumerate(np.diff(course.times)):
-        constant[i + 1] = constant[i] + length * (course.constant[i] + 0.5 * length * course.slope[i])
-    return TimeFunction(course.times, constant, course.constant, 0.5 * course.slope)
+    for i, length in enumerate(np.diff(function.times)):
+        constant[i + 1] = constant[i] + length * (function.constant[i] + 0.5 * length * function.slope[i])
+    return TimeFunction(function.times, constant, function.constant, 0.5 * function.slope)
 
 
-def is_constant_function(course: TimeFunction) -> bool:
-    """Whether a course is constant."""
-    return not (course.slope.any() or course.curvature.any() or np.ptp(course.constant, axis=0).any())
+def is_constant_function(function: TimeFunction) -> bool:
+    return not (function.slope.any() or function.curvature.any() or np.ptp(function.constant, axis=0).any())
 
 
-def has_constant_direction(course: TimeFunction) -> bool:
-    """Whether every piece is linear and the vector stays on one line through zero."""
-    parts = np.concatenate([course.constant, course.slope])
+def has_constant_direction(function: TimeFunction) -> bool:
+    """Whether every piece is linear and the vector remains on one line through zero."""
+    parts = np.concatenate([function.constant, function.slope])
     longest = parts[np.linalg.norm(parts, axis=1).argmax()]
     off = np.abs(np.cross(parts, longest)).max()
-    return not course.curvature.any() and bool(off <= 1e-12 * (longest @ longest))
+    return not function.curvature.any() and bool(off <= 1e-12 * (longest @ longest))
 
 
-def values_at(course: TimeFunction, times: np.ndarray) -> np.ndarray:
+def values_at(function: TimeFunction, times: np.ndarray) -> np.ndarray:
     """Values (t, 3) at times (t,)."""
-    i, d = _places(course, times)
-    return course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
+    i, d = _locate(function, times)
+    return function.constant[i] + d * (function.slope[i] + d * function.curvature[i])
 
 
-def piece_at(course: TimeFunction, time: float) -> TimeFunction:
-    """The piece just after a time, without an end, as a course."""
-    i, d = _places(course, np.array([time]))
-    constant = course.constant[i] + d * (course.slope[i] + d * course.curvature[i])
-    return TimeFunction(np.array([time]), constant, course.slope[i] + 2 * d * course.curvature[i], course.curvature[i])
+def piece_at(function: TimeFunction, time: float) -> TimeFunction:
+    """The piece that begins or continues at a time, as a function without an end."""
+    i, d = _locate(function, np.array([time]))
+    constant = function.constant[i] + d * (function.slope[i] + d * function.curvature[i])
+    slope = function.slope[i] + 2 * d * function.curvature[i]
+    return TimeFunction(np.array([time]), constant, slope, function.curvature[i])
 
 
-def sum_functions(courses: list[TimeFunction]) -> TimeFunction:
-    """The sum of courses."""
-    times = np.unique(np.concatenate([course.times for course in courses]))
-    constant = sum(values_at(course, times) for course in courses)
+def sum_functions(functions: list[TimeFunction]) -> TimeFunction:
+    """The sum of several functions."""
+    times = np.unique(np.concatenate([function.times for function in functions]))
+    constant = sum(values_at(function, times) for function in functions)
     slope, curvature = np.zeros((2, len(times), 3))
-    for course in courses:
-        i, d = _places(course, times)
-        slope += course.slope[i] + 2 * d * course.curvature[i]
-        curvature += course.curvature[i]
+    for function in functions:
+        i, d = _locate(function, times)
+        slope += function.slope[i] + 2 * d * function.curvature[i]
+        curvature += function.curvature[i]
     return TimeFunction(times, constant, slope, curvature)
 
 
-def _places(course: TimeFunction, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    i = np.searchsorted(course.times, times, side="right") - 1
-    return i, (times - course.times[i])[:, None]
+def _locate(function: TimeFunction, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    i = np.searchsorted(function.times, times, side="right") - 1
+    return i, (times - function.times[i])[:, None]
 
 
 @kernel(inline=True)
-def value(course, time, k):
+def value(function, time, k):
     """Component k at a time, from the first piece."""
-    d = time - course.times[0]
-    return course.constant[0, k] + d * (course.slope[0, k] + d * course.curvature[0, k])
+    d = time - function.times[0]
+    return function.constant[0, k] + d * (function.slope[0, k] + d * function.curvature[0, k])
 
 
 @kernel(inline=True)
-def rate(course, time, k):
+def rate(function, time, k):
     """Rate of change of component k at a time, from the first piece."""
-    return course.slope[0, k] + 2 * (time - course.times[0]) * course.curvature[0, k]
+    return function.slope[0, k] + 2 * (time - function.times[0]) * function.curvature[0, k]

@@ -1,7 +1,6 @@
 """The translation of a single body: free, none, or through an ideal fluid with added mass.
 
-A flight is a term: `translate(flight, ...)` is chosen by its type at compile time, so that a pinned body compiles no
-translation.
+`translate(translation, ...)` is chosen by the type at compile time, so a pinned body compiles no translation.
 """
 
 from typing import NamedTuple
@@ -19,7 +18,7 @@ class FreeTranslation(NamedTuple):
 
 
 class NoTranslation(NamedTuple):
-    """One point of the body is fixed at the origin; position and velocity are not stored."""
+    """A pinned body: one point is fixed at the origin; position and velocity are not stored."""
 
     mass: float
 
@@ -36,42 +35,42 @@ class FluidTranslation(NamedTuple):
     inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
 
 
-def translate(flight, rotor, state, time, h):
+def translate(translation, rotor, state, time, h):
     """Flow of the kinetic energy of a single body, from `time` to time + h, in place."""
     raise TypeError("compiled code only")
 
 
 @implements(translate, inline=True)
-def _carry(flight, rotor, state, time, h):
-    if is_a(flight, NoTranslation):
-        return lambda flight, rotor, state, time, h: rotate_body(rotor, state, time, h)
-    if is_a(flight, FreeTranslation):
+def _carry(translation, rotor, state, time, h):
+    if is_a(translation, NoTranslation):
+        return lambda translation, rotor, state, time, h: rotate_body(rotor, state, time, h)
+    if is_a(translation, FreeTranslation):
 
-        def fly(flight, rotor, state, time, h):
+        def fly(translation, rotor, state, time, h):
             for k in range(3):
                 state.position[0, k] += h * state.velocity[0, k]
             rotate_body(rotor, state, time, h)
 
         return fly
 
-    def swim(flight, rotor, state, time, h):
-        translate_in_fluid(flight, state, 0.5 * h)
+    def swim(translation, rotor, state, time, h):
+        translate_in_fluid(translation, state, 0.5 * h)
         rotate_body(rotor, state, time, h)
-        translate_in_fluid(flight, state, 0.5 * h)
+        translate_in_fluid(translation, state, 0.5 * h)
 
     return swim
 
 
 @kernel(inline=True)
-def translate_in_fluid(flight, state, h):
+def translate_in_fluid(translation, state, h):
     """Exact flow of sum P_k²/(2 M_k): P and Q are constant, X += h Q v, L += h P x v."""
     q = state.rotation[0]
-    p0 = flight.mass * body_component(q, state.velocity[0], 0)
-    p1 = flight.mass * body_component(q, state.velocity[0], 1)
-    p2 = flight.mass * body_component(q, state.velocity[0], 2)
-    v0 = p0 / flight.inertial_mass[0]
-    v1 = p1 / flight.inertial_mass[1]
-    v2 = p2 / flight.inertial_mass[2]
+    p0 = translation.mass * body_component(q, state.velocity[0], 0)
+    p1 = translation.mass * body_component(q, state.velocity[0], 1)
+    p2 = translation.mass * body_component(q, state.velocity[0], 2)
+    v0 = p0 / translation.inertial_mass[0]
+    v1 = p1 / translation.inertial_mass[1]
+    v2 = p2 / translation.inertial_mass[2]
     for k in range(3):
         state.position[0, k] += h * (q[k, 0] * v0 + q[k, 1] * v1 + q[k, 2] * v2)
     state.angular_momentum_body[0, 0] += h * (p1 * v2 - p2 * v1)
@@ -85,18 +84,18 @@ def body_component(rotation, vector_lab, k):
     return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
 
 
-def inertial_mass(flight, k):
+def inertial_mass(translation, k):
     """Mass, with added mass, for motion along body axis k."""
     raise TypeError("compiled code only")
 
 
 @implements(inertial_mass, inline=True)
-def _inertial_mass(flight, k):
-    if is_a(flight, FluidTranslation):
-        return lambda flight, k: flight.inertial_mass[k]
-    return lambda flight, k: flight.mass
+def _inertial_mass(translation, k):
+    if is_a(translation, FluidTranslation):
+        return lambda translation, k: translation.inertial_mass[k]
+    return lambda translation, k: translation.mass
 
 
-def inertial_masses(flight: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
+def inertial_masses(translation: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
     """Mass, with added mass, along the body's axes (3,), for Python."""
-    return flight.inertial_mass if isinstance(flight, FluidTranslation) else np.full(3, flight.mass)
+    return translation.inertial_mass if isinstance(translation, FluidTranslation) else np.full(3, translation.mass)
