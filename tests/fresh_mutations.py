@@ -54,9 +54,9 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F8", "angular momenta of frames: along the axes of the lab, not of the body",
-        "analysis/history.py",
-        "L[own] = np.einsum(\"nij,ni->nj\", turn, lab)",
-        "L[own] = lab",
+        "run/rigid_fit.py",
+        "L[index] = np.einsum(\"nij,ni->nj\", rotation, lab)",
+        "L[index] = lab",
         ("test_analyse.py::test_rigid_bodies_come_back_from_their_sites",),
     ),
     Mutation(
@@ -282,8 +282,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F40", "a stage after Langevin: the energy of the momentum that is taken out is booked with the wrong sign",
         "run/molecular.py",
-        "            self.state.energy_ledger[TAKEN] -= remove_momentum(",
-        "            self.state.energy_ledger[TAKEN] += remove_momentum(",
+        "            self.state.energy_ledger[REMOVED] -= remove_momentum(",
+        "            self.state.energy_ledger[REMOVED] += remove_momentum(",
         ("test_baths.py::test_degrees_of_freedom_follow_the_thermostat",),
     ),
 ]  # fmt: skip

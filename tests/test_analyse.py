@@ -167,7 +167,9 @@ def test_torn_molecules_are_found(mixture):
     sites = np.array([mixture.site_positions(state)] * 2)
     torn = int(np.flatnonzero(mixture.sites.molecule == 15)[1])
     sites[1, torn, 0] += 40.0
-    with pytest.raises(OutputError, match=r"frame 2: a site of molecule 16 is \d+ Å away from its position in the rigid spce"):
+    with pytest.raises(
+        OutputError, match=r"frame 2: a site of molecule 16 is \d+ Å away from its position in the rigid spce"
+    ):
         rebuilt(mixture, sites, None, np.array([state.cell] * 2), wrapped=False)
 
 

@@ -14,7 +14,7 @@ from support import (
     EnergyWalk,
     Method,
     TrialSystem,
-    _fitted,
+    _fit_step,
     averages,
     bias_of_potential,
     choice,
@@ -140,7 +140,10 @@ def known(monkeypatch):
     """
 
     def make(jump):
-        true, rng = EnergyWalk(1e-9 / EnergyWalk(1.0, jump, 600).rate(SCHEMES["srkn_4"], 5e-3), jump, 600), np.random.default_rng(1)
+        true, rng = (
+            EnergyWalk(1e-9 / EnergyWalk(1.0, jump, 600).rate(SCHEMES["srkn_4"], 5e-3), jump, 600),
+            np.random.default_rng(1),
+        )
 
         def regular(scheme, dt):
             return 1e-3 * (dt / 5e-3) ** scheme.order
@@ -159,7 +162,9 @@ def known(monkeypatch):
         monkeypatch.setattr(choice, "measure_errors", measure_errors)
         monkeypatch.setattr(walk, "measure_errors", measure_errors)
         methods = {name: Method(None, scheme) for name, scheme in SCHEMES.items()}
-        trial_system = TrialSystem("", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600)
+        trial_system = TrialSystem(
+            "", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600
+        )
         return trial_system, {name: 5.0 * scheme.force_evaluations for name, scheme in SCHEMES.items()}, error
 
     return make
@@ -212,7 +217,10 @@ def test_what_cannot_be_kept_is_said(capsys, tmp_path):
         ({"integrator": "auto", "energy_error_kT": 1e-3, "timestep_fs": 1.0}, "timestep_fs would do nothing with"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "rotor": "split"}, "rotor would do nothing with"),
         ({"integrator": "auto", "energy_error_kT": 1e-3, "bias_kT": 1e-3}, "needs one of"),
-        ({"integrator": "auto", "bias_kT": 1e-3}, "bias_kT is for averages at a temperature, and nve has no thermostat"),
+        (
+            {"integrator": "auto", "bias_kT": 1e-3},
+            "bias_kT is for averages at a temperature, and nve has no thermostat",
+        ),
         ({"bias_kT": 1e-3}, "bias_kT would do nothing without integrator = 'auto'"),
     ],
 )
@@ -311,7 +319,7 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
     ],
 )
 def test_a_chosen_step_of_a_body_fits_its_duration_and_samples(timestep, duration, interval, wanted):
-    found = _fitted(timestep, duration, interval)
+    found = _fit_step(timestep, duration, interval)
     assert found == pytest.approx(wanted, rel=1e-12)
     assert round(duration / found) * found == pytest.approx(duration, rel=1e-12)
     assert found <= timestep * (1 + 1e-9)

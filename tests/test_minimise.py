@@ -17,11 +17,11 @@ from support import (
     build,
     describe,
     load_model,
+    measure_accuracy,
     minimise,
     mobile,
     molecular_run,
     panels,
-    measure_accuracy,
     read_frames,
     read_record,
     shaken,
@@ -479,7 +479,7 @@ def test_a_scene_through_the_command_line(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "minimise: converged after" in said
     assert "cell: converged after" in said
-    assert "bar of the one asked for" in said
+    assert "bar of the given pressure" in said
     with (tmp_path / "out" / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["Stage"] for row in rows] == ["minimise", "minimise", "cell", "nvt", "nvt"]

@@ -160,13 +160,13 @@ def again(stopped, tmp_path):
 def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     folder = str(again / "run")
     assert cli.main(["resume", folder]) == 0
-    assert read_checkpoint(again / "run" / CHECKPOINT).told["position"]["first"] == 0
+    assert read_checkpoint(again / "run" / CHECKPOINT).told["place"]["first"] == 0
     assert cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"]) == 0
     steps = [int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]]
     assert steps == list(range(0, 121, 10))
     capsys.readouterr()
     assert cli.main(["resume", folder, "--until", "0.05ps"]) == 2
-    assert "longer already, 120 steps" in capsys.readouterr().err
+    assert "already longer, 120 steps" in capsys.readouterr().err
 
 
 def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
@@ -186,8 +186,8 @@ def test_a_folder_is_all_that_is_needed(stopped, tmp_path):
     assert [path.name for path in parts.iterdir() if path.name.startswith("input_")] == ["input_structure_final.npz"]
 
 
-def test_compare_tells_where_two_runs_part(again, stopped, tmp_path, capsys):
-    """A run beside itself, beside its continuation, and beside one of another scene whose log was changed in a bit."""
+def test_compare_reports_where_two_runs_diverge(again, stopped, tmp_path, capsys):
+    """A run and itself, its continuation, and a run of another scene whose log was changed in a bit."""
     one, other = str(stopped / "run"), again / "run"
     assert cli.main(["compare", one, str(other)]) == 0
     assert "the runs are the same to the last bit\n" in capsys.readouterr().out
@@ -206,11 +206,11 @@ def test_compare_tells_where_two_runs_part(again, stopped, tmp_path, capsys):
     scene.write_text(scene.read_text().replace("seed = 1", "seed = 5"))
     assert cli.main(["compare", one, str(other)]) == 1
     said = capsys.readouterr().out
-    assert "seed: 1 against 5" in said
-    assert "the runs part at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
+    assert "seed: 1 and 5" in said
+    assert "the runs diverge at Step 20, sample 3 of 7" in said and "last 1 of 53 bits" in said
     assert cli.main(["compare", one, str(other), "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
-    assert [apart["column"] for apart in told["course"]["first"]] == ["Kinetic Energy (kJ/mole)"]
+    assert [cell["column"] for cell in told["samples"]["first"]] == ["Kinetic Energy (kJ/mole)"]
     assert cli.main(["compare", one, str(tmp_path)]) == 2
     assert "is not the folder of a run" in capsys.readouterr().err
 

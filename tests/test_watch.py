@@ -449,7 +449,7 @@ def test_a_term_of_somebody_elses_spoils_no_cache(tmp_path):
         "from typing import NamedTuple\nclass Term(NamedTuple):\n    k: float\n"
     )
     (tmp_path / "shared.py").write_text(
-        "from rigidmd.compile import kernel\n@kernel(outer=True)\ndef first(term):\n    return term[0]\n"
+        "from rigidmd.compile import kernel\n@kernel(from_python=True)\ndef first(term):\n    return term[0]\n"
     )
     said = []
     for script, path in (

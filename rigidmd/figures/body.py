@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
+from rigidmd.core.files import atomic_file
 from rigidmd.figures.style import COOL, FAINT, INK, WARM, camera, circle, save_figure, settings, thin_series
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def draw_motion(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
         with settings({"svg.hashsalt": stem}):
             for ending, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
                 written.append(folder / f"{stem}.{ending}")
-                with whole_file(written[-1]) as temporary:
+                with atomic_file(written[-1]) as temporary:
                     save_figure(figure, temporary, **options)
     return written
 

@@ -4,33 +4,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidmd.core.statistics import format_signed
 from rigidmd.engines.body_motion import Motion, drawn_axis
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
 from rigidmd.engines.system import System
 from rigidmd.figures.body import motion_figures
-from rigidmd.forces.body.frame import Inertial
-from rigidmd.mechanics.free_rotor import SplitRotor
-
-if TYPE_CHECKING:
-    from rigidmd.figures.picture import Picture
-from typing import TYPE_CHECKING
-
 from rigidmd.figures.style import COOL, FAINT, INK, WARM, shown_range, thin_series
+from rigidmd.forces.body.frame import InertialFrame
+from rigidmd.mechanics.free_rotor import SplitRotor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from rigidmd.figures.picture import Picture
-from math import floor, isnan, log10
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_figures(
@@ -49,7 +36,7 @@ def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
     if len(samples) <= 2:
         return {}
     columns = dict(samples.columns)
-    if system.turns:  # omega along the principal axes, where it lies on ellipsoids
+    if system.rotates:  # omega along the principal axes, where it lies on ellipsoids
         omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
         columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
     gravity = system.scene.gravity and system.scene.gravity.acceleration_m_s2
@@ -60,16 +47,19 @@ def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
         inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
         invariants=samples.invariants,
         gravity=None if gravity is None else np.array(gravity),
-        flies=system.flies,
+        flies=system.translates,
     )
 
 
 def _keeps_its_ellipsoids(system: BodySystem, samples: Motion) -> bool:
     """Whether the inertia is constant, the frame does not turn, and |L| is conserved: no torque acts."""
-    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, Inertial)
+    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
     return steady and "L_size" in samples.invariants
 
 
+#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
+LETTER_WIDTH, MOST_ROWS = 0.012, 5
+#: Columns of the samples in energy.png.
 DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "temperature_rotation")
 
 
@@ -135,7 +125,7 @@ def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.nda
     if last.sum() > 2 and gradient is not None:
         line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
         axis.plot(time[last], line, color=WARM, lw=1.4)
-        title = f"{told['name']}: drift {signed(gradient, error)} kJ/mol/ns per molecule"
+        title = f"{told['name']}: drift {format_signed(gradient, error)} kJ/mol/ns per molecule"
         axis.set_title(title, loc="left", fontsize=9, color=WARM)
     axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
 
@@ -145,7 +135,7 @@ def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
     left, right = axis.get_xlim()
     rows: list[float] = []  # where the last name of each row ends, as a fraction of the axis
     for start, label in zip(starts, labels, strict=True):
-        at, long = (start - left) / ((right - left) or 1.0), 0.015 + LETTER * len(label)
+        at, long = (start - left) / ((right - left) or 1.0), 0.015 + LETTER_WIDTH * len(label)
         at_end = at > 0.5 and at + long > 1.0
         begin, end = (at - long, at) if at_end else (at, at + long)
         row = next((k for k, taken in enumerate(rows) if begin >= taken), len(rows))
@@ -158,18 +148,3 @@ def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
         )  # fmt: skip
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + 0.09 * len(rows) * (high - low))
-
-
-#: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.
-LETTER, MOST_ROWS = 0.012, 5
-
-
-def signed(value: float, error: float | None) -> str:
-    """value ± error, rounded to two digits of the error."""
-    if error is None or isnan(error):
-        return f"{value:+.3g} ({NO_ERROR})"
-    digits = max(0, 1 - floor(log10(error))) if error > 0 else 3
-    return f"{value:+.{digits}f} ± {error:.{digits}f}"
-
-
-NO_ERROR = "too short for an error"

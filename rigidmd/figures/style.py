@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.core.files import whole_file
-from rigidmd.core.process import ONE_AT_A_TIME
+from rigidmd.core.files import atomic_file
+from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.errors import RigidMDError, RigidMDWarning
 
 #: Points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
@@ -49,7 +49,7 @@ def settings(changed: dict) -> Iterator[None]:
     """Within it Matplotlib has other settings. It has one set of them for all threads."""
     from matplotlib import rc_context
 
-    with ONE_AT_A_TIME, rc_context(changed):
+    with PROCESS_LOCK, rc_context(changed):
         yield
 
 
@@ -58,7 +58,7 @@ def drawing(path: Path) -> Iterator[Path]:
     """A file to draw into, which takes its place when it is complete. Results do not depend on pictures and pages: an
     error becomes a warning. Raises OutputError if it cannot be written."""
     try:
-        with whole_file(path) as temporary:
+        with atomic_file(path) as temporary:
             yield temporary
     except RigidMDError:
         raise

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rigidmd.run.results import Results
 
-#: Two times of a run are the same within this fraction.
+#: Times of a run that differ by less than this fraction are equal.
 SAME_TIME = 1e-9
 
 
@@ -27,33 +27,33 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
     """See `Results.atoms`."""
     system = results.system
     if not isinstance(system, System):
-        raise ValueError("this is the run of a single body, which has no atoms")
+        raise ValueError("this is a run of a single body, which has no atoms")
     if frame is None:
         return _final(results, system)
     count = len(results._frames)
     if count == 0:
-        raise ValueError("this run kept no frames (output.trajectory = false); atoms() is the final state")
-    chosen = _chosen(frame, count)
+        raise ValueError("this run has no frames (output.trajectory = false); atoms() is the final state")
+    indices = _frame_indices(frame, count)
     read = _reader(results, system)
     at_end = _same(results._frames[-1].time, float(results.state.time[NOW]))
-    found = [_final(results, system) if at_end and k == count - 1 else read(k) for k in chosen]
-    return found if isinstance(chosen, range) else found[0]
+    found = [_final(results, system) if at_end and k == count - 1 else read(k) for k in indices]
+    return found if isinstance(indices, range) else found[0]
 
 
-def _chosen(frame: int | slice | str, count: int) -> range | list[int]:
+def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     """Indices of frames: a range for several, a list of one for an index. Raises IndexError, ValueError."""
-    asked: Any = frame
+    wanted: Any = frame
     if isinstance(frame, str):
         with contextlib.suppress(ValueError):
             parts = [int(part) if part.strip() else None for part in frame.split(":")]
-            asked = parts[0] if len(parts) == 1 else slice(*parts) if len(parts) < 4 else frame
-    if isinstance(asked, slice) and asked.step != 0:
-        return range(count)[asked]
-    if not isinstance(asked, int | np.integer):
+            wanted = parts[0] if len(parts) == 1 else slice(*parts) if len(parts) < 4 else frame
+    if isinstance(wanted, slice) and wanted.step != 0:
+        return range(count)[wanted]
+    if not isinstance(wanted, int | np.integer):
         raise ValueError(f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'")
-    if not -count <= asked < count:
-        raise IndexError(f"there is no frame {asked}: this run has {count}")
-    return [int(asked) % count]
+    if not -count <= wanted < count:
+        raise IndexError(f"there is no frame {wanted}: this run has {count}")
+    return [int(wanted) % count]
 
 
 def _final(results: "Results", system: System) -> "ase.Atoms":

@@ -47,8 +47,8 @@ def ase_results(
 ) -> dict[str, Any]:
     """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³) as ASE has them.
 
-    The stress is from the molecular virial, without the ideal part: the derivative of the energy for a strain that moves
-    centres of mass and rotates nothing, over the volume.
+    The stress is from the molecular virial, without the ideal part: the derivative of the energy for a strain that
+    moves centres of mass and rotates nothing, over the volume.
     """
     still = state._replace(
         velocity=np.zeros_like(state.velocity), angular_momentum_body=np.zeros_like(state.angular_momentum_body)
@@ -71,7 +71,9 @@ def gradient_forces(system: System, state: State, load: Load, atoms: np.ndarray 
     return _gradient_forces(system, state, load.force, _torque_lab(state, load), atoms)
 
 
-def site_forces(system: System, engine: Engine, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
+def site_forces(
+    system: System, engine: Engine, state: State, load: Load, atoms: np.ndarray | None = None
+) -> np.ndarray:
     """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with the totals of `load`.
 
     engine : has just evaluated `load` at the state. Forces on whole molecules, such as gravity, are in the first form.
@@ -94,7 +96,9 @@ def site_forces(system: System, engine: Engine, state: State, load: Load, atoms:
     found = force[atom] + _massless_forces_on_atoms(system, state, force)[atom]
     of_atom, n = system.sites.molecule[atom], len(state.position)
     rest = load.force - _sum_per_molecule(of_atom, found, n)
-    torque = _torque_lab(state, load) - _sum_per_molecule(of_atom, np.cross(_from_centre(system, state, arm, atoms), found), n)
+    torque = _torque_lab(state, load) - _sum_per_molecule(
+        of_atom, np.cross(_from_centre(system, state, arm, atoms), found), n
+    )
     return found + _gradient_forces(system, state, rest, torque, atoms)
 
 
@@ -181,7 +185,9 @@ def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
     if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(molecule.radius, 1.0):
         return weight[:, None, None] * np.eye(3)
     totals = np.hstack([np.vstack([np.eye(3), _cross(x)]) for x in heavy])
-    return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ np.vstack([np.eye(3), _cross(position)])).reshape(-1, 3, 3)
+    return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ np.vstack([np.eye(3), _cross(position)])).reshape(
+        -1, 3, 3
+    )
 
 
 def _cross(x: np.ndarray) -> np.ndarray:

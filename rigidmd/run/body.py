@@ -84,7 +84,7 @@ class BodySimulation(Simulation):
     def _reset(self) -> None:
         self.engine = self.system.engine()
         if isinstance(self.engine, OdeEngine):
-            self.engine.halts = self._must_end
+            self.engine.stop_requested = self._must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
@@ -121,7 +121,7 @@ class BodySimulation(Simulation):
         arrays, method = kept.of("state").arrays, self.system.method
         check_same_scene(self.scene, self._resume_data.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
-        k = kept.told["position"]["segment"]
+        k = kept.told["place"]["stretch"]
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)

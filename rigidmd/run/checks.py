@@ -13,8 +13,8 @@ import numpy as np
 from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import Load, State
-from rigidmd.dynamics.observables import LargestValues, largest_values
 from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.observables import LargestValues, largest_values
 from rigidmd.engines.body_motion import energies, is_balanced
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.cpu import BehindWallError, NotFiniteError
@@ -42,7 +42,7 @@ MOVES_PER_CHECK, EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 250_000, 1_000_000, 
 
 
 class FailedCheck(SimulationError):
-    """A check that failed, with a sentence that says how.
+    """A failed check; its message is a sentence.
 
     molecule : index of the molecule concerned
     factor : by which the step would have to be shorter to stay within the limit, if known

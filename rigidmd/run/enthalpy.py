@@ -21,7 +21,7 @@ class EnthalpyPoint(NamedTuple):
     energy: float  # potential energy with constants and tail correction, u Å²/ps²
     scale: float  # sum of the absolute values of its parts, to which rounding is relative
     load: Load
-    pressure: np.ndarray  # (6,) by `boxes.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
+    pressure: np.ndarray  # (6,) by `barostats.COMPONENTS`, without the kinetic part, u/(Å ps²); NaN without a box
     gradient: np.ndarray  # (k,) of the enthalpy in the coordinates of `Enthalpy.moved`, u Å/ps²
 
     @property
@@ -31,20 +31,20 @@ class EnthalpyPoint(NamedTuple):
 
 
 class Enthalpy:
-    """Enthalpy U + P V for a stage with a relaxing cell, else the potential energy U. Frozen molecules do not move.
+    """Enthalpy U + P V for a stage with a relaxing cell, or else the potential energy U. Frozen molecules do not move.
 
     A move from a state is a vector (k,) of lengths (Å), scaled so that all second derivatives are of the same order:
 
         shifts of centres of mass (3 n), lab frame
         rotations about principal axes, Q <- Q exp(hat(phi)), as phi times the radius of the molecule (3 n; 0 of points)
         strains of the cell, one for each coordinate of the coupling: R <- R T, cell <- cell T, where T is lower
-        triangular as in `boxes`, with the exponentials of the first three strains on its diagonal and the others below.
+        triangular as in `barostats`, with the exponentials of the first three strains on its diagonal, the rest below.
         A strain is multiplied by sqrt(m N) (V/N)^(1/3), for N molecules and m components that share the coordinate:
         in a strain all N distances to neighbours, about (V/N)^(1/3), change together. A flexible cell of ice Ih (192
         TIP4P/2005) took 50 iterations; 54 and 338 with strains scaled by 0.3 and 3 times as much, 63 and 59 with
         rotations scaled by 0.5 and 2 times as much
 
-    Axes without inertia do not turn. The derivative for the strain follows from the molecular virial W = sum F (x) R,
+    Axes without inertia do not rotate. The derivative for the strain follows from the molecular virial W = sum F (x) R,
     dU/dT_ij = -W_ji. Forces between sites are in double precision, because energies in single precision have too few
     digits near a minimum.
 
@@ -55,17 +55,17 @@ class Enthalpy:
         model, self._system = system.model, system
         self.engine = system.engine_of(system.terms, "double")
         self.free = mobile(model)
-        turning = len(state.rotation)
-        self.turns = (model.inertia > 0)[model.species][:turning]
+        count = len(state.rotation)
+        self.rotates = (model.inertia > 0)[model.species][:count]
         radius = np.array([m.radius for m in system.species])
-        self._arm = np.where(radius > 0, radius, 1.0)[model.species][:turning, None]
+        self._arm = np.where(radius > 0, radius, 1.0)[model.species][:count, None]
         #: Coordinate of each component of the strain; -1: none.
         self.coordinate = np.array(COUPLINGS[stage.pressure_coupling] if stage.changes_box else [-1] * 6)
-        self.asked = np.array(stage.pressures[0] if stage.changes_box else [0.0] * 6) * BAR
+        self.target = np.array(stage.pressures[0] if stage.changes_box else [0.0] * 6) * BAR
         shared = np.bincount(self.coordinate[self.coordinate >= 0])
         n = len(state.position)
         self._lengths = np.sqrt(shared * n) * np.cbrt(state.volume / n) if len(shared) else np.zeros(0)
-        self._ends = np.cumsum([state.position.size, self.turns.size])
+        self._ends = np.cumsum([state.position.size, self.rotates.size])
 
     def at(self, state: State) -> EnthalpyPoint:
         """Energy and gradient at a state, which is not copied. Raises SimulationError."""
@@ -81,11 +81,11 @@ class Enthalpy:
                 pressure[:3] += self._system.tail.pressure(volume)
         used = self.coordinate >= 0
         slopes = np.zeros(len(self._lengths))
-        np.add.at(slopes, self.coordinate[used], volume * (self.asked - pressure)[used])
+        np.add.at(slopes, self.coordinate[used], volume * (self.target - pressure)[used])
         gradient = np.concatenate(
             [
                 (-load.force * self.free[:, None]).ravel(),
-                (-load.torque_body * self.turns / self._arm).ravel(),
+                (-load.torque_body * self.rotates / self._arm).ravel(),
                 slopes / self._lengths,
             ]
         )
@@ -93,7 +93,7 @@ class Enthalpy:
 
     def moved(self, state: State, move: np.ndarray) -> State:
         """A copy of a state after a move (k,)."""
-        shift, turn, strain = self._parts(move)
+        shift, rotation, strain = self._parts(move)
         found = state.copy()
         if strain.any():
             matrix = np.diag(np.exp(strain[:3]))
@@ -102,27 +102,27 @@ class Enthalpy:
             found.position[:] = state.position @ matrix
             found.cell[:] = state.cell @ matrix
         found.position[:] += shift
-        if len(turn):
-            found.rotation[:] = state.rotation @ from_vector(turn / self._arm)
+        if len(rotation):
+            found.rotation[:] = state.rotation @ from_vector(rotation / self._arm)
         return found
 
     def gain(self, point: EnthalpyPoint, other: EnthalpyPoint, move: np.ndarray) -> float:
         """Change of the enthalpy by a move from a point to another, u Å²/ps².
 
-        Deviatoric pressures act as true (Cauchy) stress, as in `boxes`: their work is that in the mean volume of the
-        move. It is not a difference of a function of the cell, so only changes are defined, not the enthalpy itself.
+        Deviatoric pressures act as true (Cauchy) stress, as in `barostats`: their work is taken in the mean volume of
+        the move. No function of the cell has these differences, so only changes of the enthalpy are defined.
         """
         gained = other.energy - point.energy
         if not len(self._lengths):
             return gained
-        before, after, mean = point.state.volume, other.state.volume, self.asked[:3].mean()
-        deviation = self.asked - np.where(np.arange(6) < 3, mean, 0.0)
+        before, after, mean = point.state.volume, other.state.volume, self.target[:3].mean()
+        deviation = self.target - np.where(np.arange(6) < 3, mean, 0.0)
         return gained + mean * (after - before) + 0.5 * (before + after) * float(deviation @ self._parts(move)[2])
 
     def reach(self, move: np.ndarray) -> tuple[float, float]:
         """Largest shift or rotation (times the radius) of a molecule in a move, Å; largest strain."""
-        shift, turn, strain = self._parts(move)
-        lengths = [np.linalg.norm(part, axis=1).max(initial=0.0) for part in (shift, turn)]
+        shift, rotation, strain = self._parts(move)
+        lengths = [np.linalg.norm(part, axis=1).max(initial=0.0) for part in (shift, rotation)]
         return float(max(lengths)), float(np.abs(strain).max())
 
     def largest(self, point: EnthalpyPoint) -> tuple[float, float, float]:
@@ -131,12 +131,12 @@ class Enthalpy:
         Pressures are averaged over the components that share a coordinate; 0 if the cell does not relax.
         """
         force = np.linalg.norm(point.load.force[self.free], axis=1).max(initial=0.0)
-        torque = np.abs(point.load.torque_body * self.turns).max(initial=0.0)
-        off = [abs(np.mean((point.pressure - self.asked)[self.coordinate == c])) for c in range(len(self._lengths))]
+        torque = np.abs(point.load.torque_body * self.rotates).max(initial=0.0)
+        off = [abs(np.mean((point.pressure - self.target)[self.coordinate == c])) for c in range(len(self._lengths))]
         return float(force), float(torque), float(max(off, default=0.0))
 
     def _parts(self, move: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shifts (n, 3) and scaled rotations (n, 3), Å, and strains (6,) of a move."""
-        shift, turn, strain = np.split(move, self._ends)
+        shift, rotation, strain = np.split(move, self._ends)
         each = np.append(strain / self._lengths, 0.0)[self.coordinate]
-        return shift.reshape(-1, 3), turn.reshape(-1, 3), each
+        return shift.reshape(-1, 3), rotation.reshape(-1, 3), each

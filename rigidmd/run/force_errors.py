@@ -1,4 +1,4 @@
-"""Errors of the forces of a scene: of Ewald sums, and of single precision between pairs."""
+"""Errors of the forces of a scene: of Ewald sums, estimated and measured, and of single precision between pairs."""
 
 from math import pi, sqrt
 from typing import NamedTuple, cast
@@ -19,7 +19,7 @@ from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB
 
-#: Accuracy of the reference sum, relative to the estimated error of the sum under test.
+#: Error of the reference sum, relative to the estimated error of the sum under test.
 REFERENCE_ERROR = 1e-3
 MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
 
@@ -36,7 +36,7 @@ class CoulombErrors(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """Measured, over the rms force."""
+        """The measured error over the rms force."""
         return self.measured / self.force
 
 
@@ -73,25 +73,24 @@ def coulomb_errors(system: System, state: State) -> CoulombErrors:
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
-    """The estimated rms error of Coulomb forces on sites in another cell (3, 3), u Å/ps²: waves, grid and alpha stay
-    as they are. The system has Ewald sums.
-    """
-    over, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
+    """The estimated rms error of Coulomb forces on sites in another cell (3, 3), u Å/ps², with the k-vectors, grid and
+    alpha of a system that has Ewald sums."""
+    term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charged = [m.charges != 0 for m in system.species]
     charges = charges_of(
         [(int(n), m.charges[c], m.positions_body[c]) for n, m, c in zip(counts, system.species, charged, strict=True)]
     )
-    if isinstance(over, Pme):
-        wave = pme_error(charges, over.alpha, cell, over.grid, over.order)
+    if isinstance(term, Pme):
+        reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
     else:
-        over = cast(EwaldSum, over)
-        wave = k_space_error(charges, over.alpha, k_cutoff_of_count(over.k_vectors.total, volume), volume)
-    return float(np.hypot(real_error(charges, over.alpha, system.cutoff, volume), wave)) * COULOMB
+        term = cast(EwaldSum, term)
+        reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
+    return float(np.hypot(real_error(charges, term.alpha, system.cutoff, volume), reciprocal)) * COULOMB
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
-    """Relative rms errors of forces and torques from `precision = "mixed"`; None in double precision."""
+    """Relative rms errors of forces and torques with `precision = "mixed"`; None in double precision."""
     scene = system.scene
     if scene.precision == "double":
         return None
@@ -105,7 +104,7 @@ def single_precision_errors(system: System, state: State) -> tuple[float, float]
 
 
 def _real_part(system: System) -> PairForces:
-    """The term of an Ewald sum that acts between pairs."""
+    """The real-space term of an Ewald sum."""
     return cast(PairForces, system.terms["coulomb_real"])
 
 
@@ -127,15 +126,15 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
 
 
 def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
-    """Forces (s, 3) that cancel those of the reciprocal part between sites of one molecule."""
+    """Forces (s, 3) that cancel the forces of the reciprocal part between sites of one molecule."""
     force = np.zeros_like(position)
     count = np.diff(first)
-    for apart in range(1, count.max(initial=1)):
-        i = np.concatenate([np.arange(a, a + n - apart) for a, n in zip(first[:-1], count, strict=True) if n > apart])
-        d = position[i] - position[i + apart]
+    for gap in range(1, count.max(initial=1)):
+        i = np.concatenate([np.arange(a, a + n - gap) for a, n in zip(first[:-1], count, strict=True) if n > gap])
+        d = position[i] - position[i + gap]
         r = np.linalg.norm(d, axis=1)
         slope = erf(alpha * r) / r**3 - 2 * alpha / sqrt(pi) * np.exp(-((alpha * r) ** 2)) / r**2
-        pull = (charge[i] * charge[i + apart] * slope)[:, None] * d
+        pull = (charge[i] * charge[i + gap] * slope)[:, None] * d
         np.subtract.at(force, i, pull)
-        np.add.at(force, i + apart, pull)
+        np.add.at(force, i + gap, pull)
     return force

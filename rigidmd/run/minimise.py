@@ -167,7 +167,7 @@ class _Descent:
             move = length * direction
             try:
                 other = self._enthalpy.at(self._enthalpy.moved(point.state, move))
-            except SimulationError:  # behind a wall, or a box too small for the cut-off
+            except SimulationError:  # behind a wall, or a box too small for the cutoff
                 if length < SHORTEST:
                     raise
                 length *= 0.1
@@ -212,7 +212,7 @@ def _check_charges(system: System, point: EnthalpyPoint) -> None:
     a, b = checks.site_labels(system, pair)
     one, other = system.sites.name[[pair.first, pair.second]]
     raise SimulationError(
-        f"the energy has no lower bound: {a} and {b}, of opposite charge, are {pair.distance:.3g} Å apart, and no "
-        "repulsion acts between them. Try giving one of these sites sigma_A and epsilon_kJ_mol, or the "
-        f'pair an entry [[forces.pairs]] with sites = ["{one}", "{other}"]'
+        f"the energy has no lower bound: {a} and {b}, of opposite charge, are at {pair.distance:.3g} Å, and no "
+        "repulsion acts between them. Try giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an "
+        f'entry [[forces.pairs]] with sites = ["{one}", "{other}"]'
     )

@@ -66,7 +66,7 @@ class MolecularResumeData(ResumeData):
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
     stage: Count = 0  # the present one
-    removal: OverlapRemoval | None = None  # of overlaps, before the first step
+    removal: OverlapRemoval | None = Field(None, serialization_alias="relief", validation_alias="relief")
     choices: dict[Count, str] = Field(default_factory=dict)  # of integrator and step, with the reasons
     stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
     moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
@@ -190,8 +190,8 @@ class MolecularSimulation(Simulation):
                         self.scene.source,
                         [
                             f"the molecules cannot be packed at {self.system.density:.3g} g/cm³ without overlap: after "
-                            f"{removal.steps} steps of overlap removal the first time step would still change a momentum "
-                            f"by {removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
+                            f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
+                            f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
                             "shorten timestep_fs of the first stage"
                         ],
                     )
@@ -212,7 +212,7 @@ class MolecularSimulation(Simulation):
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
 
     def _check(self, other: "ExternalEngine") -> None:
-        """Compare the start with that of the external engine, and close it. Raises EngineError if they differ."""
+        """Compare energies and forces at the start with an external engine, and close it. Raises EngineError."""
         from rigidmd.engines.comparison import compare_at, describe_comparison
 
         try:
@@ -250,9 +250,9 @@ class MolecularSimulation(Simulation):
         check_same_scene(self._built.scene, data.scene | {"stages": decided or before}, data.inputs, step)
         for k, (chosen, then) in enumerate(zip(data.stages, before, strict=True)):
             if k not in data.choices and plain(chosen) != then:
-                raise ValueError(f"its stages.{k} is not that of its scene")
+                raise ValueError(f"its stages.{k} differs from its scene")
         known = (*data.choices, *data.stable, *data.moves, *data.minima)
-        if data.stage != kept.told["position"]["segment"] or any(k > data.stage for k in known):
+        if data.stage != kept.told["place"]["stretch"] or any(k > data.stage for k in known):
             raise ValueError(f"it has data of later stages than {data.stage}, or is of another stage")
         stages = list(data.stages)
         stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
@@ -265,7 +265,7 @@ class MolecularSimulation(Simulation):
         self.state = state_from(kept.of("state").arrays, like)
         moves = any(before.has_barostat or before.is_minimisation for before in stages[: data.stage + 1])
         if not moves and not np.array_equal(self.state.cell, self._built.state.cell):
-            raise ValueError("its box is not that of the scene")
+            raise ValueError("its box differs from the box of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
 
     def _reenter_segment(self, k: int) -> Segment:

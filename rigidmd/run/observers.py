@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rigidmd.core.state import NOW, State
+from rigidmd.io.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint, count_list
 from rigidmd.io.folder import SCENE
-from rigidmd.io.frame import Frame
 
 if TYPE_CHECKING:
     from rigidmd.engines.samples import Sample
@@ -105,7 +105,7 @@ class Observer:
         return Checkpoint({}, {})
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check files without changes.
+        """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check files unchanged.
 
         The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
         """
@@ -121,7 +121,7 @@ class Observer:
         """Called in any case: close files."""
 
     def failed(self, run: "Simulation") -> str:
-        """Called if the run stops with an error: save results. Returns a sentence that names the file, or an empty one."""
+        """Called if the run stops with an error: save results. Returns a sentence that names the file, or ""."""
         return ""
 
 

@@ -1,4 +1,4 @@
-"""Keywords of simulations, for type checkers and editors."""
+"""Types of the keywords of simulations, for type checkers and editors."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypedDict

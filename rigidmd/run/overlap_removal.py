@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.dynamics.momenta import mobile
 from rigidmd.dynamics.model import Model
+from rigidmd.dynamics.momenta import mobile
 from rigidmd.engines.cpu import BehindWallError
 from rigidmd.engines.protocol import Engine
 from rigidmd.mechanics.rotation import from_vector

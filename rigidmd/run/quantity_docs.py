@@ -1,4 +1,4 @@
-"""Explanations of the values of `rigidmd energy` whose names are not enough."""
+"""Explanations of values of `rigidmd energy`: of Coulomb energies, virial and pressure."""
 
 from math import inf
 from typing import cast
@@ -25,44 +25,44 @@ def describe_quantities(system: System) -> dict[str, str]:
 
 
 def _describe_reaction_field(system: System) -> dict[str, str]:
-    """Of a reaction field."""
+    """Explanations of the energies of a reaction field."""
     if system.cutoff == inf or "coulomb" not in system.terms:
         return {}
     name = system.scene.forces.truncation
     shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).potential).truncation
     start = 0.0 if isinstance(shape, Unmodified) else shape.start
-    ends = {"plain": "", "shift": ", less its value at the cut-off", "force_shift": ", less its value and slope there"}
+    ends = {"plain": "", "shift": ", less its value at the cutoff", "force_shift": ", less its value and slope there"}
     if name in ends:
         how = ends[name]
     elif name == "force_switch":
         how = f", its force switched off from {start:g} Å on"
     else:
-        how = f", less its value at the cut-off, times {name} from {start:g} Å on"
+        how = f", less its value at the cutoff, times {name} from {start:g} Å on"
     return {
-        "coulomb": f"q q (1/r + k r²) up to the cut-off{how}",
+        "coulomb": f"q q (1/r + k r²) up to the cutoff{how}",
         "reaction_field_self": "charges of each molecule in their own reaction field",
     }
 
 
 def _describe_ewald(system: System) -> dict[str, str]:
-    """Of Ewald sums; they depend on whether the real-space energy is shifted."""
-    real, own = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
+    """Explanations of the energies of Ewald sums, which depend on whether the real-space energy is shifted."""
+    real, self_energy = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
     if system.scene.forces.ewald_truncation == "plain":
-        return {"coulomb_real": f"{real}, plain at the cut-off", "coulomb_self": own}
+        return {"coulomb_real": f"{real}, plain at the cutoff", "coulomb_self": self_energy}
     charged = any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species)
     more = (
-        ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cut-off"
+        ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cutoff"
         if charged
         else "; shifted energies add nothing to it, as every molecule is neutral"
     )
-    return {"coulomb_real": f"{real}, less its value at the cut-off", "coulomb_self": own + more}
+    return {"coulomb_real": f"{real}, less its value at the cutoff", "coulomb_self": self_energy + more}
 
 
 def _describe_pressure(system: System) -> dict[str, str]:
-    """Of virial and pressure: which of them includes constant parts."""
+    """Explanations of virial and pressure, with the constant parts that they include."""
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
-        virial += ", of their forces on one another: fields, walls and restraints act from outside and add nothing"
+        virial += ", of the forces between molecules; fields, walls and restraints do not contribute"
     if system.tail is not None:
         virial += ", without the tail correction"
         pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"

@@ -152,9 +152,9 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
     return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
-def _temperatures(stage: dict, ending: str) -> str:
+def _temperatures(stage: dict, suffix: str) -> str:
     values = (
-        ("T_trans", stage[f"temperature_translation_{ending}"]),
-        ("T_rot", stage[f"temperature_rotation_{ending}"]),
+        ("T_trans", stage[f"temperature_translation_{suffix}"]),
+        ("T_rot", stage[f"temperature_rotation_{suffix}"]),
     )
     return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)

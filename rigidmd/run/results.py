@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
-    from rigidmd.io.frame import Frame
+    from rigidmd.io.atoms import Frame
 
 
 @dataclass(repr=False)
@@ -96,8 +96,8 @@ class Results(Displayed):
     def universe(self) -> "MDAnalysis.Universe":
         """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from memory.
 
-        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its time in the run, even if
-        the file format has no times. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
+        Lengths in Å, times in ps; for a body a second becomes a picosecond. Every frame has its time in the run, also
+        where the file format has none. Warns if frames are not evenly spaced. Raises ValueError without a trajectory.
         """
         from rigidmd.io import trajectory
 

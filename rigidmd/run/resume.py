@@ -85,7 +85,7 @@ def read_as(kind: type[T], data: Any) -> T:
 class ResumeData(BaseModel):
     """The data of a run, besides its state, that a checkpoint needs: what evolves, and the scene."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", populate_by_name=True)
 
     scene: dict[str, Any] = {}
     inputs: dict[str, str] = {}  # key -> SHA-256
@@ -93,7 +93,7 @@ class ResumeData(BaseModel):
 
     def to_json(self, **changes: Any) -> dict[str, Any]:
         """JSON values for a checkpoint, which `read_as` reads."""
-        return plain(self.model_copy(update=changes))
+        return self.model_copy(update=changes).model_dump(mode="json", exclude_none=True, by_alias=True)
 
 
 @contextlib.contextmanager

@@ -45,8 +45,8 @@ class RigidFit:
             off = np.abs(at - centre[index][:, None] - arms).max(axis=(1, 2), initial=0.0)
             if (worst := float(off.max(initial=0.0))) > MAX_DEVIATION + MAX_RELATIVE_DEVIATION * kind.molecule.radius:
                 raise OutputError(
-                    f"a site of molecule {index[off.argmax()] + 1} is {worst:.2g} Å away from its position in the rigid "
-                    f"{kind.name}: the molecules of a trajectory must be whole, and be the molecules of this run"
+                    f"a site of molecule {index[off.argmax()] + 1} is {worst:.2g} Å away from its position in the "
+                    f"rigid {kind.name}: the molecules of a trajectory must be whole, and be the molecules of this run"
                 )
             if self._rotates:
                 Q[index] = rotation

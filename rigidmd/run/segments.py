@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from operator import and_
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, NonNegativeInt
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.run.observers import Observer, above_zero
+from rigidmd.run.resume import read_as
 
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -62,6 +63,15 @@ class RunPosition(NamedTuple):
     time: NonNegative = 0.0  # at the start of the segment, ps or s
     computing: tuple[NonNegative, ...] = ()  # seconds, of the segments before
     seconds: NonNegative = 0.0  # of computing in this segment
+
+    def to_json(self) -> dict[str, Any]:
+        """For a checkpoint, where the segment is called stretch."""
+        return {"stretch" if name == "segment" else name: value for name, value in self._asdict().items()}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "RunPosition":
+        """Raises ValueError."""
+        return read_as(RunPosition, {"segment" if key == "stretch" else key: data[key] for key in data})
 
 
 class RunTimes(NamedTuple):

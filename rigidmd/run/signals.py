@@ -1,4 +1,4 @@
-"""Signals to a run. Python handles them in its main thread only; in others these do nothing."""
+"""Signals to a run. Python handles them in its main thread only; in other threads these functions do nothing."""
 
 import _thread
 import contextlib
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 @contextlib.contextmanager
 def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[None]:
-    """Within it these signals call a function with their number."""
+    """Context in which these signals call a function with their number."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -23,20 +23,18 @@ def signal_handler(handler: Callable[[int], None], *numbers: int) -> Iterator[No
 
 
 def stop_signals() -> list[int]:
-    """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own way to end."""
+    """The signals that end runs: Ctrl-C, and SIGTERM unless the program has its own handler."""
     return [signal.SIGINT, *([signal.SIGTERM] if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL else [])]
 
 
-#: Seconds until Ctrl-C is tried again that came where Python ignores exceptions.
+#: Seconds until a Ctrl-C is repeated that came where Python ignores exceptions.
 RETRY_DELAY = 0.05
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Within it Ctrl-C is not lost in a compiler, which ignores it while LLVM calls Python, or ends in another error.
-
-    Raises KeyboardInterrupt, at the end if it did not before.
-    """
+    """Context in which Ctrl-C is not lost in a compiler, which ignores it while LLVM calls Python, or raises another
+    error. Raises KeyboardInterrupt, at the latest at its end."""
     has_handler = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
     if has_handler or threading.current_thread() is not threading.main_thread():
         yield

@@ -43,7 +43,7 @@ from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
 from rigidmd.run.provenance import computed_with, input_digests, provenance
 from rigidmd.run.report import write_summary
 from rigidmd.run.results import Results
-from rigidmd.run.resume import as_checkpoint_errors, describe_changes, read_as
+from rigidmd.run.resume import as_checkpoint_errors, describe_changes
 from rigidmd.run.segments import ObservationSchedule, RunPosition, RunTimes, Segment
 from rigidmd.run.signals import interruptible, signal_handler, stop_signals
 from rigidmd.scene import BodyScene, MolecularScene, Scene
@@ -94,7 +94,7 @@ class Simulation(Displayed, Base):
     folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder
     observers : user-defined, called between steps: `Every`, `LivePlot`, any `Observer`
-    say : called with a sentence before something slow (compiling, pilot runs). Default: printed with the progress
+    `say` : called with a sentence before something slow (compiling, pilot runs). Default: printed with the progress
     warn : called with each warning; the summary repeats them. Default: a `RigidMDWarning` of Python's `warnings`
     resume : continue from the last checkpoint in the folder, to the same bits; begin if the folder is empty or absent
     walltime : seconds from now until the run has to have ended; it stops shortly before, with a checkpoint
@@ -349,12 +349,12 @@ class Simulation(Displayed, Base):
 
     @abstractmethod
     def _restore(self, kept: Checkpoint) -> None:
-        """Return to a checkpoint, instead of `_prepare`. Raises CheckpointError if it is of another scene, ValueError if
-        no run can have written it."""
+        """Return to a checkpoint, instead of `_prepare`. Raises CheckpointError if it is of another scene, ValueError
+        if no run can have written it."""
 
     def _checked_position(self, kept: Checkpoint) -> RunPosition:
         """The position of a checkpoint, compared with the scene and the state. Raises ValueError."""
-        position, state = read_as(RunPosition, kept.told["position"]), self.state
+        position, state = RunPosition.from_json(kept.told["place"]), self.state
         if position.segment >= len(self._durations()) or len(position.computing) != position.segment:
             raise ValueError(f"it is of stage {position.segment} of {len(self._durations())}")
         first, time = 0, 0.0
@@ -459,9 +459,9 @@ class Simulation(Displayed, Base):
             arrays |= {f"{owner}/{name}": array for name, array in kept.items()}
         arrays |= {f"state/{name}": array for name, array in zip(STORED_NAMES, self.state, strict=True)}
         arrays |= {f"engine/{name}": array for name, array in memory.items()}
-        told = {"with": computed_with(), "position": position._asdict(), "run": self._resume_json(), "of": of}
+        data = {"with": computed_with(), "place": position.to_json(), "run": self._resume_json(), "of": of}
         self._checkpoints.write_once(
-            Checkpoint(told, arrays), (position.segment, int(self.state.step[NOW]), position.seconds > 0)
+            Checkpoint(data, arrays), (position.segment, int(self.state.step[NOW]), position.seconds > 0)
         )
 
     def _run_segments(
@@ -485,7 +485,7 @@ class Simulation(Displayed, Base):
                 if k == 0 and not resumed:
                     self._notify(observers, Moment(self, 0, 0.0, 0), [o.interval is not None for o in observers])
                     self._checkpoint(named, position)
-                agenda = ObservationSchedule(observers, segment)
+                schedule = ObservationSchedule(observers, segment)
                 if segment.action is not None:
                     began = clock.perf_counter()
                     segment.action(progress)
@@ -495,16 +495,16 @@ class Simulation(Displayed, Base):
                 shown, pace = None, inf
                 bar.unpause()
                 while done < segment.steps and not self._interrupted:
-                    to = agenda.next_observation(done)
+                    to = schedule.next_observation(done)
                     if pace > 0:
                         to = min(
                             to, done + max(1, int(SEGMENT_SECONDS / pace))
                         )  # the first step alone, as it may be slow
-                    before, shown = shown, agenda.due(to)
-                    looked = agenda.reads_energies(shown)
+                    before, shown = shown, schedule.due(to)
+                    with_energies = schedule.reads_energies(shown)
                     began = clock.perf_counter()
                     try:
-                        self.engine.advance(self.state, segment.method, segment.dt, position.first + to, looked)
+                        self.engine.advance(self.state, segment.method, segment.dt, position.first + to, with_energies)
                     except Halted:
                         shown = before
                         break

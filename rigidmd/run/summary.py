@@ -1,7 +1,6 @@
 """The summary of a run, of molecules or of a single body: one dictionary with units in its keys, and its notes."""
 
 from collections import Counter
-from collections.abc import Sequence
 from math import isnan, sqrt
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ MOTION_KEYS = (
     "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
     "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
 )  # fmt: skip
-#: The second half of a stage has notes if it has so many samples, on effects larger than so many standard errors.
+#: The second half of a stage has notes if it has enough samples, on effects larger than some standard errors.
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
 #: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
@@ -138,8 +137,8 @@ def _momentum_removed(system: System, state: State) -> dict | None:
 
 
 def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]:
-    """A note if the molecules drift together: if a conserved momentum, whose degrees of freedom are not counted, shows in
-    the temperatures, or if one that is not conserved exceeds a thermal one."""
+    """A note if the molecules drift together: if a conserved momentum, whose degrees of freedom are not counted, adds
+    to the temperatures, or if one that is not conserved exceeds a thermal one."""
     if not system.freedom.translation or not last.temperature_translation > 0:
         return []
     mass = system.model.mass[system.model.species]
@@ -171,7 +170,7 @@ def ewald_error_notes(system: System, state: State) -> list[str]:
     before, after = (f"{error / COULOMB:.2g}" for error in (system.force_error, now))
     return [
         f"the box has changed, and with it the estimated error of Coulomb forces, from {before} to {after} e²/Å²: "
-        "alpha, k-vectors and grid are those of the start. A run with structure.file = 'final.npz' chooses them anew"
+        "alpha, k-vectors and grid are still from the start. A run with structure.file = 'final.npz' chooses new ones"
     ]
 
 
@@ -222,9 +221,9 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     if gap is not None and error is not None and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error):
         found.append(
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {rotating.mean():.4g} K"
-            f"{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K that sampling does not explain: timestep_fs is too "
-            "long, or translation and rotation exchange energy too slowly for this stage. Try a shorter step, or run "
-            "longer before means are taken"
+            f"{corrected}, a difference of {abs(gap):.2g} ± {error:.1g} K that sampling does not explain: timestep_fs "
+            "is too long, or translation and rotation exchange energy too slowly in this stage. Try a shorter step, or "
+            "run longer before means are taken"
         )
     return found
 

@@ -11,72 +11,72 @@ from rigidmd.run.results import Results
 from rigidmd.run.signals import signal_handler, stop_signals
 from rigidmd.run.simulation import Simulation
 
-#: Seconds between two looks at who has asked to stop.
+#: Seconds between two checks for signals.
 POLL_INTERVAL = 0.2
 
 
 def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> list[Results | None]:
     """Run simulations at once, each on one thread; their results in the same order, with the bits of `run`.
 
-    Many small systems use the cores better so than one after another on all cores: a thread waits for no other, and
-    the steps of one run go on while another is looked at.
+    For many small systems this is faster than one run after another on all cores: no thread waits for another, and the
+    steps of one run continue while the observers of another are called.
 
-    jobs : runs at a time; default: as many as there are cores
+    jobs : runs at a time; default: the number of cores
 
-    Ctrl-C and SIGTERM stop all at their next looks; what had not begun is None in the list. A second Ctrl-C raises
-    KeyboardInterrupt then. If a run fails, the others go on, and the first error is raised at the end, with a note on
-    the runs that failed. The simulations keep to one thread, in their summaries and scenes too.
+    Ctrl-C and SIGTERM stop all runs at their next observations; a run that had not begun is None in the list. A second
+    Ctrl-C then raises KeyboardInterrupt. If a run fails, the others continue, and the first error is raised at the end,
+    with a note on the runs that failed. Summaries and scenes of the simulations have one thread.
     """
     simulations = list(simulations)
-    if strange := [one for one in simulations if not isinstance(one, Simulation)]:
-        raise TypeError(f"{strange[0]!r:.60} is not a Simulation")
-    if len({id(one) for one in simulations}) < len(simulations):
+    if wrong := [value for value in simulations if not isinstance(value, Simulation)]:
+        raise TypeError(f"{wrong[0]!r:.60} is not a Simulation")
+    if len(set(map(id, simulations))) < len(simulations):
         raise ValueError("a simulation is given twice; make one for each run")
     if jobs is not None and jobs < 1:
         raise ValueError(f"jobs = {jobs}: at least one run at a time")
-    for one in simulations:
-        one.take_threads(1)
+    for simulation in simulations:
+        simulation.take_threads(1)
     begun: list[Simulation] = []
-    asked: list[int] = []  # the signals that end runs, so far
+    received: list[int] = []  # the signals that end runs, so far
 
-    def run(one: Simulation) -> Results | None:
-        if asked:
+    def run(simulation: Simulation) -> Results | None:
+        if received:
             return None
-        begun.append(one)
-        return one.run(progress=False)
+        begun.append(simulation)
+        return simulation.run(progress=False)
 
     def stop_all() -> None:
-        for one in begun:
-            one.stop(asked[0])
+        for simulation in begun:
+            simulation.stop(received[0])
 
     def stop(number: int) -> None:
-        again = bool(asked) and number == signal.SIGINT
-        asked.append(number)
+        again = bool(received) and number == signal.SIGINT
+        received.append(number)
         stop_all()
         if again:
             raise KeyboardInterrupt
 
     def ask_for_checkpoints(number: int) -> None:
-        for one in begun:
-            one.ask_for_checkpoint(number)
+        for simulation in begun:
+            simulation.ask_for_checkpoint(number)
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(signal_handler(stop, *stop_signals()))
         if hasattr(signal, "SIGUSR1"):
             stack.enter_context(signal_handler(ask_for_checkpoints, signal.SIGUSR1))
         pool = stack.enter_context(ThreadPoolExecutor(jobs or MOST_THREADS, "run"))
-        futures = [pool.submit(run, one) for one in simulations]
+        futures = [pool.submit(run, simulation) for simulation in simulations]
         running = set(futures)
         while running:
             _, running = wait(running, POLL_INTERVAL)
-            if asked:
-                stop_all()  # again and again: one that was just beginning did not hear it
+            if received:
+                stop_all()  # repeatedly: a run that was just beginning may have missed it
     _raise_first([future.exception() for future in futures])
     return [future.result() for future in futures]
 
 
 def _raise_first(errors: Sequence[BaseException | None]) -> None:
-    """Raise the first error, with a note on which runs failed; nothing if there is none."""
+    """Raise the first error, if there is one, with a note on which runs failed."""
     failed = [k for k, error in enumerate(errors) if error is not None]
     if failed:
         error = cast(BaseException, errors[failed[0]])

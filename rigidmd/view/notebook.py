@@ -102,7 +102,7 @@ def _rows(scene: Scene) -> list[Row]:
             return list(_body_rows(build_body(scene)))
         return list(_molecular_rows(cast(MolecularScene, scene)))
     except InputError as error:
-        return [("this scene", scene.in_short), *(("fault", fault) for fault in error.faults)]
+        return [("this scene", scene.in_short), *(("fault", fault) for fault in error.errors)]
 
 
 def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
@@ -117,7 +117,7 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
     forces = scene.forces
     acting = ["Lennard-Jones"] if forces.lennard_jones and any((m.epsilon > 0).any() for m in species) else []
     acting += [COULOMB[forces.electrostatics]] if any(m.charges.any() for m in species) else []
-    acting += [f"cut-off {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
+    acting += [f"cutoff {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
     yield "forces", ", ".join(acting) or "none of the models"
     for force in forces.custom:
         yield OWN, f"{force.name}: {force.energy or force.module}"

@@ -1,1 +1,1 @@
-"""Pilot runs: they choose an integrator and a time step, and find the longest stable step."""
+"""Pilot runs: short runs from the start of a stage, by which `integrator = "auto"` chooses integrator and time step."""

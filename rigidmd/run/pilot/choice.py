@@ -1,8 +1,8 @@
-"""The cheapest integrator and time step for an accuracy, found by runs from the start.
+"""The choice of `integrator = "auto"` for an error of energy or trajectory: the cheapest integrator and step.
 
 Cost is counted in force evaluations, not seconds, so a scene leads to the same choice on every machine. An error of the
-energy is to hold over the whole run: short pilots measure the regular error of each step, `measure.energy_walk` the random
-walk of the energy by truncated forces, and a longer pilot of the best step its slow regular error.
+energy has to hold over the whole run: short pilot runs measure the regular error of each step, `energy_walk` the random
+walk of the energy by truncated forces, and a longer pilot run of the best step its slow regular error.
 """
 
 from dataclasses import replace
@@ -18,20 +18,19 @@ from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.energy_walk import EnergyWalk, measure_energy_walk
 from rigidmd.run.pilot.trials import Trial, TrialSystem, final_state, measure_errors, state_difference
 
-#: Tried in this order. A later one is given up at a step that is too long and costs more.
+#: Tried in this order. A later one is abandoned at a step that is too long and costs more.
 CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
-#: Most trials of each, the part of its longest step that is short enough to give up, and the gain worth another trial.
-TRIALS, SHORTEST, GAIN = 16, 4096, 1.1
+#: Most trials of each, how much its longest step is shortened at most, and the least gain for another trial.
+MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
 #: Most halvings of the reference's step.
 HALVINGS = 12
 #: An interpolated step is shortened by this factor, so that its error falls below the target.
 MARGIN = 0.95
-#: Expected error over a run that is longer than its pilots, in the target: one walk in ten is 1.5 times as large.
-SAFE = 0.65
-#: Part of a run that the pilot of the best step takes; the least and the most of it, in short pilots; how often the
-#: step is corrected by it.
-PART, LEAST, MOST, CORRECTIONS = 0.05, 10.0, 100.0, 3
-#: What makes a walk of the energy smaller.
+#: Expected error over a run longer than its pilot runs, in the target: one random walk in ten is 1.5 times as large.
+SAFETY = 0.65
+#: Length of the pilot run of the best step: as a part of the run; least and most, in short pilot runs; how often it
+#: corrects the step.
+LONG_PILOT_PART, LONG_PILOT_MIN, LONG_PILOT_MAX, CORRECTIONS = 0.05, 10.0, 100.0, 3
 REMEDIES = "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy smaller"
 
 
@@ -39,7 +38,7 @@ class Choice(NamedTuple):
     """The cheapest integrator with its step, and the expected error."""
 
     integrator: str
-    timestep: float  # in the subject's unit
+    timestep: float  # in the unit of the `TrialSystem`
     error: float
     forces: float  # evaluations per unit of time of the span
     reason: str
@@ -48,62 +47,55 @@ class Choice(NamedTuple):
 class _Search:
     """The longest steps of the candidates within a target for an error (an attribute of `Trial`) over a time."""
 
-    def __init__(
-        self, trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None
-    ):
-        self.trial_system, self.target, self.error, self.longest, self.exact = (
-            trial_system,
-            target,
-            error,
-            longest,
-            exact,
-        )
+    def __init__(self, system: TrialSystem, target: float, error: str, longest: dict[str, float], exact: State | None):
+        self.system, self.longest, self.exact = system, longest, exact
+        self.target, self.error = target, error
         self.energy_walk: EnergyWalk | None = None
-        self.time = trial_system.span
-        self.slow: dict[str, float] = {}  # regular errors over a longer pilot, in those of the short one
+        self.time = system.span
+        self.slow_factor: dict[str, float] = {}  # regular error in a longer pilot run over that in the short one
         self.found: dict[str, Trial] = {}
-        self.measured: dict[str, Trial] = {}  # the last one of each that has an error
+        self.measured: dict[str, Trial] = {}  # the last one of each integrator that has an error
         self._tried: dict[tuple[str, float], Trial] = {}
 
     def best(self) -> Trial | None:
-        """The trial with the fewest forces; None if no step tried keeps the error."""
+        """The trial with the fewest forces; None if no trial is within the target."""
         self.found = {}
         for name in CANDIDATES:
             if name in self.longest:
                 cheapest = min(map(self.cost, self.found.values()), default=inf)
-                if trial := self._longest_good(name, cheapest):
+                if trial := self._longest_step(name, cheapest):
                     self.found[name] = trial
         return min(self.found.values(), key=self.cost, default=None)
 
     def cost(self, trial: Trial) -> float:
         """Forces per unit of time of the span."""
-        trial_system = self.trial_system
-        return trial_system.methods[trial.integrator].force_evaluations / (trial.timestep * trial_system.time_size)
+        system = self.system
+        return system.methods[trial.integrator].force_evaluations / (trial.timestep * system.time_size)
 
-    def walked(self, name: str, timestep: float, time: float) -> float:
-        """Mean square of the energy's walk."""
-        scheme = self.trial_system.methods[name].scheme
+    def walk_square(self, name: str, timestep: float, time: float) -> float:
+        """Mean square of the random walk of the energy."""
+        scheme = self.system.methods[name].scheme
         if self.energy_walk is None or not isinstance(scheme, Scheme):
             return 0.0
-        return self.energy_walk.square(scheme, timestep * self.trial_system.time_size, time)
+        return self.energy_walk.square(scheme, timestep * self.system.time_size, time)
 
     def expected(self, trial: Trial, timestep: float | None = None) -> float:
         """Error over the time; at another step by the order of the integrator."""
         name, step = trial.integrator, timestep or trial.timestep
-        order = self.trial_system.methods[name].order
-        regular = self.slow.get(name, 1.0) * getattr(trial, self.error) * (step / trial.timestep) ** order
-        return sqrt(regular**2 + self.walked(name, step, self.time))
+        order = self.system.methods[name].order
+        regular = self.slow_factor.get(name, 1.0) * getattr(trial, self.error) * (step / trial.timestep) ** order
+        return sqrt(regular**2 + self.walk_square(name, step, self.time))
 
     def trial(self, name: str, timestep: float, span: float | None = None) -> Trial:
         """A trial of an integrator at a step; it ends exactly at the span if trajectories are compared."""
-        trial_system = self.trial_system if span is None else replace(self.trial_system, span=span)
-        n = max(1, ceil(trial_system.span / (timestep * trial_system.time_size) * (1 - 1e-12)))
+        system = self.system if span is None else replace(self.system, span=span)
+        n = max(1, ceil(system.span / (timestep * system.time_size) * (1 - 1e-12)))
         if self.exact is not None:
-            timestep = trial_system.span / n / trial_system.time_size
+            timestep = system.span / n / system.time_size
         if span is None and (name, timestep) in self._tried:
             return self._tried[name, timestep]
-        trial = Trial(name, timestep, n, n * trial_system.methods[name].force_evaluations)
-        measure_errors(trial_system, trial, self.exact)
+        trial = Trial(name, timestep, n, n * system.methods[name].force_evaluations)
+        measure_errors(system, trial, self.exact)
         if span is None:
             self._tried[name, timestep] = trial
         return trial
@@ -116,52 +108,52 @@ class _Search:
             low, high = (middle, high) if self.expected(trial, middle) <= self.target else (low, middle)
         return low
 
-    def _longest_good(self, name: str, cheapest: float) -> Trial | None:
-        """The longest step within the target, by the steps that trials lead to. None if none is, or all cost more."""
+    def _longest_step(self, name: str, cheapest: float) -> Trial | None:
+        """The trial with the longest step within the target. None without one, or if all cost more than `cheapest`."""
         longest = step = self.longest[name]
         good, bad = None, inf
-        for _ in range(TRIALS):
+        for _ in range(MAX_TRIALS):
             trial = self.trial(name, step)
             if not trial.diverged:
                 self.measured[name] = trial
             if not trial.diverged and self.expected(trial) <= self.target:
                 good = trial
-            elif good is None and (self.cost(trial) > cheapest or step < longest / SHORTEST):
+            elif good is None and (self.cost(trial) > cheapest or step < longest / MAX_SHORTENING):
                 return None  # a step that is too long costs more than another integrator
             else:
                 bad = trial.timestep
             if good is None:
-                step = step / 2 if trial.diverged else max(rounded_down(MARGIN * self.step_for(trial)), step / 4)
+                step = step / 2 if trial.diverged else max(round_down(MARGIN * self.step_for(trial)), step / 4)
                 continue
             step = min(MARGIN * self.step_for(good), longest)
-            step = rounded_down(step if step < bad else sqrt(good.timestep * bad))
-            if step < GAIN * good.timestep:
+            step = round_down(step if step < bad else sqrt(good.timestep * bad))
+            if step < MIN_GAIN * good.timestep:
                 return good
         return good
 
 
 def choose(
-    trial_system: TrialSystem, target: float, error: str, longest: dict[str, float], duration: float | None = None
+    system: TrialSystem, target: float, error: str, longest: dict[str, float], duration: float | None = None
 ) -> Choice:
     """The integrator and step with the fewest forces that keep an error (an attribute of `Trial`) below a target.
 
-    longest : the longest step to try of each integrator, in the subject's unit. duration : of the run over which an
-    error of the energy is to hold, if not the span. Raises SimulationError.
+    longest : the longest step to try of each integrator, in the unit of the system; duration : of the run over which an
+    error of the energy has to hold, if not the span. Raises SimulationError.
     """
-    exact = _reference(trial_system, target) if error == "trajectory_error" else None
-    search = _Search(trial_system, target, error, longest, exact)
+    exact = _reference(system, target) if error == "trajectory_error" else None
+    search = _Search(system, target, error, longest, exact)
     first = search.best()
     if first is None:
         least = min(search.measured.values(), key=lambda trial: getattr(trial, error), default=None)
         reached = "" if least is None else (
-            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {trial_system.time_unit}"
+            f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {system.time_unit}"
         )  # fmt: skip
         raise SimulationError(f"no integrator keeps its error below {target:g} with any step tried{reached}")
     best = first
-    per = "ps" if trial_system.time_unit == "fs" else "s"
-    value, over, words = getattr(best, error), f"over {trial_system.span:.3g} {per}", ""
-    if duration is not None and duration > trial_system.span:
-        best, value, words = _over(search, best, duration)
+    per = "ps" if system.time_unit == "fs" else "s"
+    value, over, words = getattr(best, error), f"over {system.span:.3g} {per}", ""
+    if duration is not None and duration > system.span:
+        best, value, words = _best_for_duration(search, best, duration)
         over = f"over {duration:.4g} {per}"
     cost, before = search.cost(best), search.cost(first)
     kind = ENERGY_ERROR if error == "energy_rms" else "error of the trajectory"
@@ -170,54 +162,55 @@ def choose(
     if common is not None and best.integrator != "velocity_verlet":
         step = min(search.step_for(common), longest["velocity_verlet"])
         fewer = search.cost(common) * common.timestep / step / cost
-        reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {trial_system.time_unit}"
+        reason += f", {fewer:.1f} times fewer than velocity_verlet at {step:.2g} {system.time_unit}"
     if value > target:
         reason += f"; no step tried keeps the target over that time: {REMEDIES}"
-    elif cost > 1.5 * before and search.walked(best.integrator, best.timestep, search.time) > 0.1 * value**2:
-        reason += f"; {cost / before:.1f} times as many as for {trial_system.span:.3g} {per} only: {REMEDIES}"
+    elif cost > 1.5 * before and search.walk_square(best.integrator, best.timestep, search.time) > 0.1 * value**2:
+        reason += f"; {cost / before:.1f} times as many as for {system.span:.3g} {per} only: {REMEDIES}"
     return Choice(best.integrator, best.timestep, value, cost, reason)
 
 
-def _over(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
-    """The best trial for a run that is longer than its pilots, its expected error, and in words how it was found."""
-    span, target = search.trial_system.span, search.target
-    search.energy_walk, search.time = measure_energy_walk(search.trial_system, first.timestep), duration
-    search.target = SAFE * target
-    long = min(duration, MOST * span, max(LEAST * span, PART * duration))
+def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[Trial, float, str]:
+    """The best trial for a run that is longer than its pilots, its expected error, and a phrase about the pilot run."""
+    span, target = search.system.span, search.target
+    search.energy_walk, search.time = measure_energy_walk(search.system, first.timestep), duration
+    search.target = SAFETY * target
+    length = min(duration, LONG_PILOT_MAX * span, max(LONG_PILOT_MIN * span, LONG_PILOT_PART * duration))
     best, value, seen = first, search.expected(first), first
     for _ in range(CORRECTIONS):
         if (found := search.best()) is None:
             break
-        best, seen = found, search.trial(found.integrator, found.timestep, long)
+        best, seen = found, search.trial(found.integrator, found.timestep, length)
         name, step = best.integrator, best.timestep
         if seen.diverged:
             search.longest[name] = step / 2
             continue
-        there = search.walked(name, step, long)
-        square = max(seen.energy_rms**2, 2 * float(np.var(seen.energies)))  # the start may be in the midst of the error
-        value = sqrt(square + search.walked(name, step, duration) - there)
-        if value <= (1 + SAFE) / 2 * target:
+        of_pilot = search.walk_square(name, step, length)
+        square = max(seen.energy_rms**2, 2 * float(np.var(seen.energies)))  # the error may not be 0 at the start
+        value = sqrt(square + search.walk_square(name, step, duration) - of_pilot)
+        if value <= (1 + SAFETY) / 2 * target:
             break
-        regular = sqrt(max(square - there, best.energy_rms**2))
-        search.slow[name] = max(1.2 * search.slow.get(name, 1.0), regular / (best.energy_rms or regular or 1.0))
-    pilot = seen.steps * seen.timestep * search.trial_system.time_size
+        regular = sqrt(max(square - of_pilot, best.energy_rms**2))
+        slow = regular / (best.energy_rms or regular or 1.0)
+        search.slow_factor[name] = max(1.2 * search.slow_factor.get(name, 1.0), slow)
+    pilot = seen.steps * seen.timestep * search.system.time_size
     return best, value, f" (expected, from {seen.energy_rms:.1e} in a pilot of {pilot:.3g} ps)"
 
 
-def rounded_down(step: float) -> float:
+def round_down(step: float) -> float:
     """A step rounded down to three digits."""
     unit = 10.0 ** (floor(log10(step)) - 2)
     return float(f"{floor(step / unit) * unit:.3g}")
 
 
-def _reference(trial_system: TrialSystem, target: float) -> State:
+def _reference(system: TrialSystem, target: float) -> State:
     """The state at the end of the span, exact to a tenth of the target. Raises SimulationError."""
-    method = trial_system.methods[trial_system.reference]
+    method = system.methods[system.reference]
     steps = 16
-    before = final_state(trial_system, method, steps)
+    before = final_state(system, method, steps)
     for _ in range(HALVINGS):
         steps *= 2
-        now = final_state(trial_system, method, steps)
+        now = final_state(system, method, steps)
         rotation, position = state_difference(now, before)
         if (position if rotation != rotation else rotation) <= 0.1 * target:
             return now

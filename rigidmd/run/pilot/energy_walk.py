@@ -27,35 +27,35 @@ import numpy as np
 from rigidmd.core.integrators import DRIFT, KICK, Scheme
 from rigidmd.run.pilot.trials import Trial, TrialSystem, measure_errors
 
-#: The integrator of the pilot runs: its own regular error is small beside the walk.
+#: The integrator of the pilot runs: its regular error is small compared with the walk.
 PILOT_INTEGRATOR = "srkn_6"
 #: Steps of the first pilot run; the second takes twice as many of half the length.
 STEPS = 32
-#: Steps between energies that are compared. The shortest are the most, but a regular error counts there.
+#: Steps between energies that are compared. Short lags have most values, but include a regular error.
 LAGS = (1, 2, 4, 8)
 JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 
 class EnergyWalk(NamedTuple):
-    """D = scale w dt^(2 jump + 2), in squares of the subject's energy unit per unit of time of its span."""
+    """D = scale w dt^(2 jump + 2), in squares of the energy unit of a `TrialSystem` per unit of time of its span."""
 
     scale: float
     jump: float  # the derivative of the force that jumps
-    freedom: int  # degrees of freedom, of one of which the energy unit is kT
+    freedom: int  # degrees of freedom; the energy unit is kT of one of them
 
     def rate(self, scheme: Scheme, dt: float) -> float:
         """D of an integrator at a step."""
         return self.scale * weight(scheme, self.jump) * dt ** (2 * self.jump + 2)
 
     def square(self, scheme: Scheme, dt: float, time: float) -> float:
-        """Expected mean square of the walk over a run: D t/2 of its scatter, and its mean."""
+        """Expected mean square of the walk over a run: D t/2 from its scatter, and the square of its mean."""
         half = self.rate(scheme, dt) * time / 2
         return half + (self.freedom * half) ** 2 / 3
 
 
 @cache
 def weight(scheme: Scheme, jump: float) -> float:
-    """w of an integrator; the sum of b² for a jump below 0, where each kick has an error of its own."""
+    """w of an integrator; the sum of b² for a jump below 0, where the errors of kicks are independent."""
     at, kicks, n = 0.0, [], np.arange(1.0, 1000.0)
     for flow in scheme.flows:
         at += flow.fraction if flow.kind == DRIFT else 0.0
@@ -66,31 +66,31 @@ def weight(scheme: Scheme, jump: float) -> float:
     return float(np.sum(np.abs(total) ** 2 / n ** (2 * jump + 2)))
 
 
-def measure_energy_walk(trial_system: TrialSystem, timestep: float) -> EnergyWalk:
-    """The walk, from runs at about this step (in the subject's unit) and at half of it."""
-    scheme, rates = trial_system.methods[PILOT_INTEGRATOR].scheme, []
+def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
+    """The walk, from runs at about this step (in the unit of the system) and at half of it."""
+    scheme, rates = system.methods[PILOT_INTEGRATOR].scheme, []
     if not isinstance(scheme, Scheme):
-        raise TypeError(f"{PILOT_INTEGRATOR} is no scheme of this subject")
+        raise TypeError(f"{PILOT_INTEGRATOR} is not a scheme of this system")
     for _ in range(3):
-        rates = [_rate(trial_system, timestep / part, part * STEPS) for part in (1, 2)]
+        rates = [_rate(system, timestep / part, part * STEPS) for part in (1, 2)]
         if None not in rates:
             break
         timestep /= 2
     fast, slow = rates
     if not fast or not slow:
-        return EnergyWalk(0.0, JUMPS[-1], trial_system.freedom)
+        return EnergyWalk(0.0, JUMPS[-1], system.freedom)
     jump = min(JUMPS, key=lambda k: abs(log(fast / slow) - (2 * k + 2) * log(2)))
-    dt = timestep * trial_system.time_size
-    unit = EnergyWalk(1.0, jump, trial_system.freedom)
+    dt = timestep * system.time_size
+    unit = EnergyWalk(1.0, jump, system.freedom)
     scale = (fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2
     return unit._replace(scale=scale)
 
 
-def _rate(trial_system: TrialSystem, timestep: float, steps: int) -> float | None:
-    """D in a run, from below by its regular error at the shortest lags; None if it diverges."""
+def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:
+    """D in a run: the least of all lags, as a regular error adds to short ones; None if the run diverges."""
     trial = Trial(PILOT_INTEGRATOR, timestep, steps, 0)
-    measure_errors(trial_system, trial, None, STEPS)
+    measure_errors(system, trial, None, STEPS)
     if trial.diverged:
         return None
-    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * trial_system.time_size
+    energy, spacing = np.array(trial.energies), steps / STEPS * timestep * system.time_size
     return min(float(np.mean((energy[m:] - energy[:-m]) ** 2)) / (m * spacing) for m in LAGS)

@@ -1,6 +1,6 @@
-"""What a time step does to averages, estimated from the mean square frequency alone.
+"""The bias of averages by the time step, from the shadow Hamiltonian; by it "auto" chooses a step for bias_kT.
 
-A symplectic step conserves a Hamiltonian of its own. Of kick, drift, kick it is, to O(dt²),
+A symplectic step conserves a shadow Hamiltonian. For kick, drift, kick it is, to O(dt²),
 
     H' = H + dt² (p.M⁻¹ U" M⁻¹ p/12 - F.M⁻¹ F/24)
 
@@ -11,12 +11,12 @@ W = <F.M⁻¹ F>/kT = <tr M⁻¹ U">, the sum of w² over f degrees of freedom, 
     <p.M⁻¹ p> = kT' (f - dt² W/6)                            at the ends of steps
     <U> - <U>_exact = dt² W kT (1 - a)/24 + C (T' - T),      a = d ln W/d ln T, C = d<U>/dT
 
-A thermostat at the ends of steps holds the kinetic energy there: T'/T = 1 + dt² W/(6 f). In the middle of a drift it is
-higher by dt² W kT/8. BAOAB, which holds that one, has T'/T = 1 - dt² W/(12 f).
+A thermostat at the ends of steps controls the kinetic energy there: T'/T = 1 + dt² W/(6 f). In the middle of a drift
+it is higher by dt² W kT/8. BAOAB, which controls the latter, has T'/T = 1 - dt² W/(12 f).
 
 Harmonic motions have a = 0 and C = f k/2. With x = dt² W/f, the mean of (w dt)², the bias of U per degree of freedom is
-then (x/24 + x/12) kT = x/8 kT of velocity Verlet, and (x/24 - x/24) kT = 0 of BAOAB: harmonic oscillators have none
-with it at any step. In a liquid the two parts do not cancel, and BAOAB's bias is taken to be as large as one of them.
+then (x/24 + x/12) kT = x/8 kT for velocity Verlet, and (x/24 - x/24) kT = 0 for BAOAB: its harmonic
+oscillators have no bias at any step. In a liquid the parts do not cancel, and the bias is taken to be one of them.
 """
 
 from dataclasses import replace
@@ -29,30 +29,30 @@ from rigidmd.core.state import State
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.run.pilot.choice import rounded_down
+from rigidmd.run.pilot.choice import round_down
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Bias of U in kT per degree of freedom, in x.
 BIAS = {"velocity_verlet": 1 / 8, "baoab": 1 / 24}
-#: The heat capacity of water says that C may be twice that of harmonic motions; the bias of velocity Verlet then too.
+#: The heat capacity of water is twice that of harmonic motions, and then the bias of velocity Verlet may be too.
 ALLOWANCE = {"velocity_verlet": 2.0, "baoab": 1.0}
-#: The same in words.
+#: Phrases for the reason of a choice.
 BASIS = {
     "velocity_verlet": "as twice the bias of harmonic motions",
     "baoab": "as one of two parts that cancel in harmonic motions",
 }
-#: A step of the pilot, and its length, for one radian of the mean motion of translation or rotation, the faster one.
+#: Step and length of the pilot run, in radians of the faster mean motion, translation or rotation; its samples.
 PILOT_STEP, PILOT_RADIANS, PILOT_SAMPLES = 0.15, 50.0, 25
-#: Longest step, in the longest stable one of the start: beyond it more than dt² counts.
-LONGEST = 0.5
+#: Longest step, as a fraction of the longest stable step: beyond it higher orders than dt² matter.
+MAX_STABLE_FRACTION = 0.5
 
 
 def sums_of_square_frequencies(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
     """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²).
 
-    By equipartition <F²/m> = kT sum w², and the same of torques. Exact in the mean over the canonical distribution.
+    By equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over the canonical distribution.
     """
     load, _ = engine.evaluate(state)
     model = system.model
@@ -68,26 +68,26 @@ def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:
 
 
 def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, str]:
-    """Stage k decided so that it keeps its bias_kT with the fewest forces, from a state on; and in words why.
+    """Stage k with the integrator and step that keep its bias_kT with the fewest forces, and the reason.
 
-    With a thermostat that the stage names: that one, at the ends of velocity Verlet's steps, and Langevin's in BAOAB
-    too. With none: velocity Verlet with velocity rescaling, or BAOAB with Langevin's. Raises SimulationError.
+    If the stage names a thermostat: velocity Verlet with it, or, if it is Langevin's, also BAOAB. Otherwise: velocity
+    Verlet with velocity rescaling, or BAOAB with Langevin's. Raises SimulationError.
     """
     stage = system.scene.stages[k]
     target = stage.bias_kT
     if target is None:
-        raise ValueError("no bias is asked for")
+        raise ValueError("the stage has no bias_kT")
     found = stiffest_mode(system, state)
     rate = mean_square_rate(system, state, k)
     steps = {}
     for integrator in BIAS:
-        if integrator == "baoab" and not _may_use_langevin(stage):
+        if integrator == "baoab" and not _allows_langevin(stage):
             continue
         decided = _decided(stage, integrator, stage.timestep_fs)
-        stable = LONGEST * stable_angle(decided.scheme) / found.rate if found else inf
+        stable = MAX_STABLE_FRACTION * stable_angle(decided.scheme) / found.rate if found else inf
         good = sqrt(target / (ALLOWANCE[integrator] * BIAS[integrator] * rate)) if rate > 0 else inf
         step = min(good, stable, stage.duration)
-        steps[integrator] = rounded_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
+        steps[integrator] = round_down(step / FEMTOSECOND) if rate > 0 else stage.timestep_fs
     best = max(steps, key=lambda name: (steps[name], -BIAS[name]))
     step = steps[best] * FEMTOSECOND
     bias = ALLOWANCE[best] * bias_of_potential(best, rate, step)
@@ -98,8 +98,8 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     )
 
 
-def _may_use_langevin(stage: Stage) -> bool:
-    """Whether the stage has Langevin's thermostat, or says nothing of its thermostat."""
+def _allows_langevin(stage: Stage) -> bool:
+    """Whether the stage has Langevin's thermostat, or names none."""
     return stage.thermostat_is_open or stage.thermostat == "langevin"
 
 
@@ -118,26 +118,26 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
     first = sums_of_square_frequencies(system, engine, state, thermal)
     fastest = max(sum_ / n for sum_, n in zip(first, freedom, strict=True) if n) if freedom.total else 0.0
     if fastest == 0 and (found := stiffest_mode(system, state)) is not None:
-        fastest = found.rate**2  # the start is a minimum, where no force says how fast motions are
+        fastest = found.rate**2  # the start is a minimum, where forces are 0
     if not isfinite(fastest) or fastest <= 0:
         return 0.0
     dt = PILOT_STEP / sqrt(fastest)
     stages = list(system.scene.stages)
-    # Langevin's thermostat at a fifth of that rate brings any start to its temperature within the first half
+    # Langevin's thermostat at a fifth of that rate brings any start to the temperature in the first half of the run
     heat = {"thermostat": "langevin", "thermostat_time_ps": None, "friction_translation_per_ps": sqrt(fastest) / 5}
     pilot_stage = stage.with_integrator("baoab", dt / FEMTOSECOND)
     stages[k] = pilot_stage.model_copy(update=heat | {"friction_rotation_per_ps": None})
     pilot = replace(system, scene=system.scene.model_copy(update={"stages": tuple(stages)}))
     scheme = integrator_of_stage(pilot, k)
-    moving = engine.begin(state, scheme)
-    moving.step[:] = 0
-    moving.begin_segment(0.0)
+    now = engine.begin(state, scheme)
+    now.step[:] = 0
+    now.begin_segment(0.0)
     every = round(PILOT_RADIANS / PILOT_STEP / PILOT_SAMPLES)
-    seen = []
-    for measure_errors in range(PILOT_SAMPLES):
-        engine.advance(moving, scheme, dt, (measure_errors + 1) * every)
-        seen.append(sum(sums_of_square_frequencies(system, engine, moving, thermal)))
-    rate = float(np.mean(seen[PILOT_SAMPLES // 2 :])) / freedom.total
+    sums = []
+    for k in range(PILOT_SAMPLES):
+        engine.advance(now, scheme, dt, (k + 1) * every)
+        sums.append(sum(sums_of_square_frequencies(system, engine, now, thermal)))
+    rate = float(np.mean(sums[PILOT_SAMPLES // 2 :])) / freedom.total
     if not isfinite(rate):
         raise SimulationError("the pilot run that measures frequencies for bias_kT has no finite forces")
     return rate

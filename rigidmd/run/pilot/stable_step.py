@@ -22,14 +22,14 @@ from rigidmd.units import BOLTZMANN, FEMTOSECOND
 #: Force evaluations for the stiffest motion; its frequency is then exact to a few percent.
 DIRECTIONS = 16
 #: Displacement for a difference of forces, in smallest diameters.
-SMALL = 1e-5
-#: Most molecules that are displaced for it: the stiffest motion is local, and each direction takes 48 B of each.
+DISPLACEMENT = 1e-5
+#: Most molecules that are displaced: the stiffest motion is local, and each direction takes 48 B per molecule.
 MOST_DISPLACED = 50_000
-#: For larger systems the estimate is made only if it costs less than 1 % of the stage.
+#: Molecules above which the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
 #: Rms amplitudes of the stiffest motions of a liquid at its temperature, as angles and in diameters. Measured by
-#: `stiffest_mode` at the end of 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in
-#: CO2 and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
+#: `stiffest_mode` after 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in CO2
+#: and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
 SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 
 
@@ -60,7 +60,7 @@ class StiffestMode(NamedTuple):
     """The fastest small motion about a state."""
 
     rate: float  # angular frequency, rad/ps
-    molecule: int  # with the largest share in it
+    molecule: int  # with the largest part in it
 
 
 def stiffest_mode(system: System, state: State, engine: Engine | None = None) -> StiffestMode | None:
@@ -76,30 +76,30 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
     moving = np.arange(len(state.position))
     if len(moving) > MOST_DISPLACED:
         moving = np.sort(np.argpartition(system.centres(state, wrapped=True)[:, 0], MOST_DISPLACED)[:MOST_DISPLACED])
-    turning = moving[: len(state.rotation)]
+    rotating = moving[: len(state.rotation)]
     mass = np.sqrt(model.inverse_mass[model.species[moving]])[:, None]
-    inertia = np.sqrt(model.inverse_inertia[model.species[turning]])
-    radius = np.array([m.radius for m in system.species])[model.species[turning], None]
+    inertia = np.sqrt(model.inverse_inertia[model.species[rotating]])
+    radius = np.array([m.radius for m in system.species])[model.species[rotating], None]
 
     def parts(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shifts and turns of molecules along a mass-weighted vector."""
+        """Shifts and rotations of molecules along a mass-weighted vector."""
         cut = 3 * len(moving)
         return mass * vector[:cut].reshape(-1, 3), inertia * vector[cut:].reshape(-1, 3)
 
     def weighted(load: Load) -> np.ndarray:
-        return np.concatenate([(mass * load.force[moving]).ravel(), (inertia * load.torque_body[turning]).ravel()])
+        return np.concatenate([(mass * load.force[moving]).ravel(), (inertia * load.torque_body[rotating]).ravel()])
 
     here, moved = weighted(engine.evaluate(state)[0]), state.copy()
     vector = np.random.default_rng(0).standard_normal(here.size)
     vector *= np.concatenate([np.repeat(mass, 3), inertia.ravel()]) > 0
     basis, matrix = [vector / sqrt(_product(vector, vector))], np.zeros((DIRECTIONS, DIRECTIONS))
     for k in range(DIRECTIONS):
-        shift, turn = parts(basis[k])
-        reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * turn).max(initial=0.0))
-        h = SMALL * system.smallest_diameter / reach
+        shift, rotation = parts(basis[k])
+        reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * rotation).max(initial=0.0))
+        h = DISPLACEMENT * system.smallest_diameter / reach
         moved.position[moving] = state.position[moving] + h * shift
-        if len(turn):
-            moved.rotation[turning] = state.rotation[turning] @ from_vector(h * turn)
+        if len(rotation):
+            moved.rotation[rotating] = state.rotation[rotating] @ from_vector(h * rotation)
         image = (here - weighted(engine.evaluate(moved)[0])) / h
         for j, other in enumerate(basis):
             matrix[j, k] = _product(other, image)
@@ -116,18 +116,18 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
     if values[-1] <= 0:
         return None
     mode = np.einsum("k,kn", vectors[:, -1], np.array(basis)) ** 2
-    share = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
-    share[: len(turning)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
-    return StiffestMode(sqrt(values[-1]), int(moving[share.argmax()]))
+    part = mode[: 3 * len(moving)].reshape(-1, 3).sum(axis=1)
+    part[: len(rotating)] += mode[3 * len(moving) :].reshape(-1, 3).sum(axis=1)
+    return StiffestMode(sqrt(values[-1]), int(moving[part.argmax()]))
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product of long vectors. `a @ b` starts threads that then wait in a loop, on cores that a run needs."""
+    """Scalar product of long vectors. `a @ b` would start threads that then spin on cores that a run needs."""
     return float(np.einsum("i,i", a, b))
 
 
 def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of steps too long for these molecules in a liquid. Nothing is compiled for them.
+    """Warnings of time steps that are too long for these molecules in a liquid, without compiled code.
 
     At a temperature T a motion of angular frequency w has the rms amplitude sqrt(kT/m)/w. So a step is unstable if a
     molecule at its thermal speed sqrt(kT/m) moves in it by more than `stable_angle` such amplitudes; the same holds
@@ -164,14 +164,14 @@ class _Swing(NamedTuple):
 
 
 def _swings(m: Molecule, thermal: float) -> list[_Swing]:
-    """Those of a molecule with a diameter in translation, and about its lightest axis. thermal : kT, u Å²/ps²"""
+    """The stiffest translation and rotation of a molecule. thermal : kT, u Å²/ps²"""
     diameter = max((sigma for sigma, epsilon in zip(m.sigma, m.epsilon, strict=True) if epsilon > 0), default=inf)
     moves = SWING_DIAMETERS * diameter * sqrt(m.mass / thermal)
     lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
-    turns = SWING_RAD * sqrt(lightest / thermal)
+    rotates = SWING_RAD * sqrt(lightest / thermal)
     return [
         _Swing(moves, SWING_DIAMETERS, "diameters", m.name, "moves"),
-        _Swing(turns, SWING_RAD, "rad", m.name, "turns about its lightest axis"),
+        _Swing(rotates, SWING_RAD, "rad", m.name, "rotates about its lightest axis"),
     ]
 
 
@@ -183,8 +183,8 @@ def is_estimate_cheap(system: System, evaluations: int) -> bool:
 def fastest_body_rate(system: BodySystem) -> float:
     """The fastest rate (rad/s) that a body's steps have to resolve at its start: swing under its weight, or spin.
 
-    The exact rotor turns a free body exactly at any spin, the split one only a symmetric body. For a weight on the axis
-    of symmetry, only the nutation remains of the spin. General solvers have to resolve all of it.
+    The exact rotor is exact for a free body at any spin, the split rotor only for a symmetric body. With a weight on
+    the axis of symmetry only the nutation has to be resolved; with general solvers, the whole spin.
     """
     if not system.rotates:
         return 0.0

@@ -1,8 +1,7 @@
-"""Error against run time: every integrator moves the same start at several time steps.
+"""Trials of integrators: runs from the same start at several time steps, for pilot runs and `rigidmd accuracy`.
 
-The cost is seconds of computing and force evaluations for a span of time. The errors are those of the trajectory at its
-end, of the energy and of other conserved quantities on the way and, for liquids on request, the bias of temperatures,
-potential energy and pressure.
+The cost is seconds of computing and force evaluations for a span of time. Errors of the trajectory are measured at the
+end, of conserved quantities on the way and, for liquids on request, of averages of temperatures, energy and pressure.
 """
 
 import time as clock
@@ -25,39 +24,39 @@ from rigidmd.errors import SimulationError
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
 
-#: Number of looks at the energy in a span.
+#: Number of observations of the energy in a span.
 OBSERVATIONS = 40
 #: A run diverges if its energy error exceeds this fraction of the kinetic energy.
 DIVERGED = 0.5
-#: Time between looks for averages, ps: about the correlation time of the kinetic energy of water.
+#: Time between samples of averages, ps: about the correlation time of the kinetic energy of water.
 SAMPLING_INTERVAL_PS = 0.02
-#: Part of an integrator's longest stable step that is recommended, where a longer one diverges.
+#: Fraction of an integrator's longest stable step that is recommended, where a longer one diverges.
 STABLE_FRACTION = 0.8
-#: Least steps in a span of a trial that extends a ladder.
+#: Least steps in a span of a trial that extends the steps of an integrator.
 MIN_STEPS = 4
 #: Steps that warm up an engine: they build lists, grow buffers and touch memory. The first 25 steps of 216 waters took
 #: 40 ms, the next 25 took 20 ms.
 WARM_UP = 10
-#: Least seconds of computing in a timing.
+#: Least seconds of computing in the timing of a span.
 TIMING_SECONDS = 0.2
-#: For general solvers that choose their own steps.
+#: Tolerances of general solvers that choose their steps.
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
 
 class Method(NamedTuple):
-    """A way to move the subject."""
+    """A way to move a system: an engine and an integrator."""
 
     engine: Callable[[], Engine]
     scheme: Scheme | Solver
 
     @property
     def chooses_steps(self) -> bool:
-        """Whether it is given a tolerance, not a time step."""
+        """Whether it has a tolerance, not a time step."""
         return isinstance(self.scheme, Solver) and self.scheme.name != RK4
 
     @property
     def force_evaluations(self) -> int:
-        """In a step of given length."""
+        """Evaluations in a step of given length."""
         return 4 if isinstance(self.scheme, Solver) else self.scheme.force_evaluations
 
     @property
@@ -68,15 +67,17 @@ class Method(NamedTuple):
 
 @dataclass
 class TrialSystem:
-    """A start, and how to measure errors on it.
+    """A start, and how to measure errors on it. Functions have the arguments engine, state and, of `observe`, step.
 
-    methods : by name. energy(engine, state) : the conserved energy. energy_unit : the unit of the reported energy
-    error, in words, with a note; energy_size : that unit in the units of `energy`. kinetic : the kinetic energy that
-    sets the limit of divergence. kept(state) : relative errors of other conserved quantities. observe(engine, state,
-    step) : the averaged observables of molecules in a box; None for others. reference : the method of the reference.
-    goes_on : whether timing may continue beyond the span; else it starts again. refused : name -> reason for methods
-    that cannot move this subject. singular : names of methods whose variables do not exist at the start.
-    rounding : relative rms errors of forces and torques in mixed precision; None in double.
+    energy : the conserved energy; energy_unit, energy_note : the unit of its reported error, as text
+    energy_size : that unit in the units of `energy`; kinetic : kinetic energy that sets the limit of divergence
+    reference : name of the method of the reference
+    conserved_errors : relative errors of other conserved quantities, of a state
+    can_continue : whether timing may continue beyond the span instead of starting again
+    refused : name -> reason for methods that cannot move this system; singular : names of methods whose variables do
+        not exist at the start
+    observe : the averaged observables of molecules in a box; None for others
+    rounding : relative rms errors of forces and torques in mixed precision; None in double
     """
 
     name: str
@@ -107,13 +108,13 @@ class Trial:
     """One integrator at one step."""
 
     integrator: str
-    timestep: float  # in the subject's unit; the mean of steps that the method chooses
+    timestep: float  # in the unit of the system; the mean of steps that the method chooses
     steps: int
     forces: int  # evaluations in the span
     seconds: list[float] = field(default_factory=list)  # of computing in a span, for each repeat
     rotation_error: float = np.nan  # largest |Q - Q_ref| at the end
     position_error: float = np.nan  # largest |X - X_ref| at the end
-    energy_rms: float = np.nan  # in the subject's unit
+    energy_rms: float = np.nan  # in the energy unit of the system
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
@@ -123,11 +124,11 @@ class Trial:
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
-    energies: list[float] = field(default_factory=list, repr=False)  # errors in the subject's unit, from 0 at the start
+    energies: list[float] = field(default_factory=list, repr=False)  # errors, from 0 at the start
 
     @property
     def diverged(self) -> bool:
-        """Whether it has no results."""
+        """Whether there are no results."""
         return bool(self.failure)
 
     @property
@@ -142,7 +143,7 @@ class Trial:
 
     @property
     def trajectory_error(self) -> float:
-        """The error of the rotation; of the position if nothing turns."""
+        """The error of the rotation, or of the position if nothing rotates."""
         return self.position_error if np.isnan(self.rotation_error) else self.rotation_error
 
 
@@ -162,7 +163,7 @@ class IntegratorAccuracy:
 
     @property
     def most_exact(self) -> Trial:
-        """The trial with the smallest energy error, whose averages are the reference of the others."""
+        """The trial with the smallest energy error, whose averages are the reference of other trials."""
         return min((t for t in self.trials if t.averages), key=lambda t: t.energy_rms)
 
     def stable_step(self, integrator: str) -> float | None:
@@ -183,24 +184,24 @@ class IntegratorAccuracy:
 
         At most its longest step, or `STABLE_FRACTION` of it where a longer one diverges.
         """
-        own = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
-        own.sort(key=lambda t: -t.timestep)
-        if not own:
+        tried = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
+        tried.sort(key=lambda t: -t.timestep)
+        if not tried:
             return None
         unstable = any(t.diverged for t in self.trials if t.integrator == integrator)
-        step = own[0].timestep if getattr(own[0], error) <= target else None
-        for coarse, fine in pairwise(own):
+        step = tried[0].timestep if getattr(tried[0], error) <= target else None
+        for coarse, fine in pairwise(tried):
             a, b = np.log(getattr(coarse, error)), np.log(getattr(fine, error))
             if step is None and b <= np.log(target) <= a:
-                share = (np.log(target) - a) / (b - a)
-                step = coarse.timestep * (fine.timestep / coarse.timestep) ** share
+                fraction = (np.log(target) - a) / (b - a)
+                step = coarse.timestep * (fine.timestep / coarse.timestep) ** fraction
         if step is None:
             return None
-        longest = max((STABLE_FRACTION if unstable else 1.0) * own[0].timestep, own[-1].timestep)
+        longest = max((STABLE_FRACTION if unstable else 1.0) * tried[0].timestep, tried[-1].timestep)
         limit = "" if step < longest else "kept from its longest stable step" if unstable else "its longest step tried"
-        step, up = float(min(step, longest)), own[::-1]
+        step, up = float(min(step, longest)), tried[::-1]
         seconds = np.exp(np.interp(np.log(step), np.log([t.timestep for t in up]), np.log([t.time for t in up])))
-        near = min(own, key=lambda t: abs(np.log(t.timestep / step)))
+        near = min(tried, key=lambda t: abs(np.log(t.timestep / step)))
         return ReachedError(float(seconds), step, near.spread or 0.0, limit)
 
 
@@ -208,78 +209,72 @@ class ReachedError(NamedTuple):
     """Where an integrator reaches an error."""
 
     seconds: float  # of computing in a span
-    step: float  # in the subject's unit
+    step: float  # in the unit of the system
     spread: float  # range of the nearest trial's seconds over their median
-    limit: str  # in words, where stability or the steps tried, and not the error, set the step
+    limit: str  # text, where stability or the steps tried, and not the error, set the step
 
 
 def measure(
-    trial_system: TrialSystem,
-    trials: list[Trial],
-    repeats: int,
-    averages: float | None = None,
-    say: Callable[[float], object] = lambda share: None,
-    extend: bool = False,
-) -> IntegratorAccuracy:
-    """Run all trials and the reference; time the trials alternately `repeats` times; report progress by say(share).
+    system: TrialSystem, trials: list[Trial], repeats: int, averages: float | None = None,
+    progress: Callable[[float], object] = lambda fraction: None, extend: bool = False,
+) -> IntegratorAccuracy:  # fmt: skip
+    """Run all trials and the reference; time the trials alternately `repeats` times.
 
-    averages : ps over which every trial is also averaged; None for no averages. extend : whether longer steps follow
-    the longest one of each integrator, doubled until one fails
+    averages : ps over which every trial is also averaged, or None; progress : called with the fraction done
+    extend : whether longer steps than the longest one of each integrator are tried, doubled until one fails
     """
     most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
-    reference = trial_system.methods[trial_system.reference]
+    reference = system.methods[system.reference]
     steps = 2 * -(-2 * most // reference.force_evaluations)
-    exact = final_state(trial_system, reference, steps)
-    own_error = state_difference(exact, final_state(trial_system, reference, steps // 2))
-    result = IntegratorAccuracy(
-        trial_system, trials, steps, max(error for error in own_error if not np.isnan(error)), averages
-    )
+    exact = final_state(system, reference, steps)
+    differences = state_difference(exact, final_state(system, reference, steps // 2))
+    result = IntegratorAccuracy(system, trials, steps, max(x for x in differences if not np.isnan(x)), averages)
     for trial in trials:  # compile and measure errors
-        measure_errors(trial_system, trial, exact)
+        measure_errors(system, trial, exact)
     if extend:
-        result.trials = trials = _extended(trial_system, trials, exact)
+        result.trials = trials = _extended(system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / trial_system.span)
+    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / system.span)
     for _ in range(repeats):
         for trial in good:
-            trial.seconds.append(time_span(trial_system, trial))
+            trial.seconds.append(time_span(system, trial))
             done += 1
-            say(done / whole)
+            progress(done / whole)
     if averages:
         for trial in good:
-            _average(trial_system, trial, averages)
-            done += averages / trial_system.span
-            say(done / whole)
+            _average(system, trial, averages)
+            done += averages / system.span
+            progress(done / whole)
     return result
 
 
-def _extended(trial_system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
-    """Trials with longer steps before those of each integrator, doubled until one fails."""
+def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Trial]:
+    """The trials, and before those of each integrator trials with longer steps, doubled until one fails."""
     found = []
-    for name, own in groupby(trials, key=lambda trial: trial.integrator):
-        ladder = list(own)
+    for name, group in groupby(trials, key=lambda trial: trial.integrator):
+        ladder = list(group)
         longest = max(ladder, key=lambda trial: trial.timestep)
         while not longest.diverged and longest.tolerance is None and longest.steps >= 2 * MIN_STEPS:
             n = longest.steps // 2
-            per_step = trial_system.methods[name].force_evaluations
-            longest = Trial(name, trial_system.span / n / trial_system.time_size, n, n * per_step)
-            measure_errors(trial_system, longest, exact)
+            per_step = system.methods[name].force_evaluations
+            longest = Trial(name, system.span / n / system.time_size, n, n * per_step)
+            measure_errors(system, longest, exact)
             ladder.insert(0, longest)
         found += ladder
     return found
 
 
-def time_span(trial_system: TrialSystem, trial: Trial) -> float:
-    """Seconds of computing in a span, from spans of `TIMING_SECONDS` seconds in all, with a warm engine.
+def time_span(system: TrialSystem, trial: Trial) -> float:
+    """Seconds of computing in a span, from spans of `TIMING_SECONDS` in total, with a warm engine.
 
     The cost of a call without steps is subtracted: 15 µs, as much as 200 steps of a free body.
     """
-    engine, state = _begin_trial(trial_system, trial)
+    engine, state = _begin_trial(system, trial)
     begun, done = state.copy(), 0
 
     def seconds_of(steps: int) -> float:
         began = clock.perf_counter()
-        _advance(trial_system, engine, state, trial, steps, done)
+        _advance(system, engine, state, trial, steps, done)
         return clock.perf_counter() - began
 
     def start_again() -> None:
@@ -304,36 +299,36 @@ def time_span(trial_system: TrialSystem, trial: Trial) -> float:
             start_again()
             continue
         calls, spans, done = calls + call, spans + 1, done + trial.steps
-        if not trial_system.can_continue:
+        if not system.can_continue:
             start_again()
     return (computing - calls if computing > calls else computing) / spans
 
 
-def plan(trial_system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
-    """Trials of integrators at time steps (in the subject's unit), adjusted to a whole number in the span.
+def plan(system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
+    """Trials of integrators at time steps (in the unit of the system), adjusted to a whole number in the span.
 
     Methods that choose their steps get tolerances instead.
     """
     trials = {}
     for integrator, timesteps in steps.items():
-        method = trial_system.methods[integrator]
+        method = system.methods[integrator]
         if method.chooses_steps:
             for tolerance in TOLERANCES:
-                step = trial_system.span / OBSERVATIONS / trial_system.time_size
+                step = system.span / OBSERVATIONS / system.time_size
                 trials[integrator, tolerance] = Trial(integrator, step, OBSERVATIONS, 0, tolerance=tolerance)
             continue
         for timestep in timesteps:
-            n = max(1, round(trial_system.span / (timestep * trial_system.time_size)))
-            step = trial_system.span / n / trial_system.time_size
+            n = max(1, round(system.span / (timestep * system.time_size)))
+            step = system.span / n / system.time_size
             trials[integrator, n] = Trial(integrator, step, n, n * method.force_evaluations)
     return list(trials.values())
 
 
-def _begin_trial(trial_system: TrialSystem, trial: Trial) -> tuple[Engine, State]:
-    """A new engine for a trial, and a state at the start."""
-    method = trial_system.methods[trial.integrator]
+def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State]:
+    """A new engine for a trial, and its state at the start."""
+    method = system.methods[trial.integrator]
     engine = method.engine()
-    return engine, engine.begin(trial_system.state, _scheme_of(method, trial))
+    return engine, engine.begin(system.state, _scheme_of(method, trial))
 
 
 def _scheme_of(method: Method, trial: Trial) -> Scheme | Solver:
@@ -343,18 +338,17 @@ def _scheme_of(method: Method, trial: Trial) -> Scheme | Solver:
     return method.scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
 
 
-def _advance(trial_system: TrialSystem, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
-    method = trial_system.methods[trial.integrator]
-    how = _scheme_of(method, trial)
-    dt = trial_system.span / trial.steps if method.chooses_steps else trial.timestep * trial_system.time_size
-    engine.advance(state, how, dt, done + steps)
+def _advance(system: TrialSystem, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
+    method = system.methods[trial.integrator]
+    dt = system.span / trial.steps if method.chooses_steps else trial.timestep * system.time_size
+    engine.advance(state, _scheme_of(method, trial), dt, done + steps)
 
 
-def final_state(trial_system: TrialSystem, method: Method, steps: int) -> State:
+def final_state(system: TrialSystem, method: Method, steps: int) -> State:
     """The state at the end of the span after this many steps."""
     engine = method.engine()
-    state = engine.begin(trial_system.state, method.scheme)
-    engine.advance(state, method.scheme, trial_system.span / steps, steps)
+    state = engine.begin(system.state, method.scheme)
+    engine.advance(state, method.scheme, system.span / steps, steps)
     return state
 
 
@@ -367,31 +361,29 @@ def _largest_difference(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.abs(x - y).max()) if len(x) else np.nan
 
 
-def measure_errors(
-    trial_system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS
-) -> None:
-    """One run that measures all errors of a trial. Its end is compared with `exact`."""
-    engine, state = _begin_trial(trial_system, trial)
-    first = trial_system.energy(engine, state)
+def measure_errors(system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS) -> None:
+    """Run a trial and measure all its errors. Its end is compared with `exact`."""
+    engine, state = _begin_trial(system, trial)
+    first = system.energy(engine, state)
     times, energies = [0.0], [0.0]
     every, done = max(1, trial.steps // observations), 0
     while done < trial.steps:
         now = min(every, trial.steps - done)
         try:
-            _advance(trial_system, engine, state, trial, now, done)
-            energy = trial_system.energy(engine, state) - first
+            _advance(system, engine, state, trial, now, done)
+            energy = system.energy(engine, state) - first
         except NotFiniteError:
             energy = np.inf
         except SimulationError as error:
             trial.failure = str(error)
             return
-        if not abs(energy) < DIVERGED * trial_system.kinetic:
+        if not abs(energy) < DIVERGED * system.kinetic:
             trial.failure = "diverges"
             return
         done += now
         times.append(done / trial.steps)
-        energies.append(energy / trial_system.energy_size)
-        for name, error in trial_system.conserved_errors(state).items():
+        energies.append(energy / system.energy_size)
+        for name, error in system.conserved_errors(state).items():
             trial.conserved_errors[name] = max(abs(error), trial.conserved_errors.get(name, 0.0))
     trial.energies = energies
     trial.energy_rms = float(np.sqrt(np.mean(np.square(energies[1:]))))
@@ -403,22 +395,22 @@ def measure_errors(
         trial.orthogonality_error = orthogonality_error(state.rotation)
     if isinstance(engine, OdeEngine) and trial.tolerance is not None:
         trial.forces = engine.evaluations
-        trial.timestep = trial_system.span / engine.own_steps / trial_system.time_size
+        trial.timestep = system.span / engine.solver_steps / system.time_size
 
 
-def _average(trial_system: TrialSystem, trial: Trial, length: float) -> None:
-    """Averages over a run of `length` ps from the start; temperatures on steps, between kicks, and unbiased."""
-    observe = trial_system.observe
+def _average(system: TrialSystem, trial: Trial, length: float) -> None:
+    """Average over a run of `length` ps from the start; temperatures at steps, between kicks, and unbiased."""
+    observe = system.observe
     if observe is None:
         raise ValueError("averages are for molecules in a box")
-    engine, state = _begin_trial(trial_system, trial)
-    dt = trial.timestep * trial_system.time_size
+    engine, state = _begin_trial(system, trial)
+    dt = trial.timestep * system.time_size
     verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
     every = max(1, round(SAMPLING_INTERVAL_PS / dt))
     seen: list[Observation] = []
     for k in range(max(2, round(length / dt / every))):
         try:
-            _advance(trial_system, engine, state, trial, every, k * every)
+            _advance(system, engine, state, trial, every, k * every)
         except SimulationError:
             return
         seen.append(observe(engine, state, verlet_step))
@@ -426,7 +418,7 @@ def _average(trial_system: TrialSystem, trial: Trial, length: float) -> None:
     def series(name: str) -> np.ndarray:
         return np.array([getattr(observation, name) for observation in seen])
 
-    found = {"potential": series("potential") / KJ_PER_MOL / trial_system.molecules, "pressure": series("pressure_bar")}
+    found = {"potential": series("potential") / KJ_PER_MOL / system.molecules, "pressure": series("pressure_bar")}
     for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
         on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
         # unbiased = (on the steps + twice between the kicks)/3

@@ -1,61 +1,60 @@
-"""`rigidmd precision`: suitable integrators at suitable time steps on the start of a scene."""
+"""`rigidmd accuracy`: the errors and run times of integrators at several time steps, from the start of a scene."""
 
 from collections.abc import Callable
 from math import inf
 
 from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
 from rigidmd.errors import SceneError
-from rigidmd.run.force_errors import rounding
+from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.pilot.trial_systems import COMPARATORS, SPAN_PS, body_trial_system, molecular_trial_system
 from rigidmd.run.pilot.trials import IntegratorAccuracy, TrialSystem, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
-from rigidmd.studies.accuracy.averages import check_is_at_home, start_of_last_stage
+from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 
-#: Default integrators: the common one, the best of each kind, and for a body the textbook solvers.
-USUAL = (
+#: Default integrators: velocity Verlet, the best of each kind, and for a body the textbook solvers.
+DEFAULT_INTEGRATORS = (
     "velocity_verlet", "two_stage", "suzuki_4", "pefrl", "chin_4a", "srkn_4", "kahan_li_6", "srkn_6", "kahan_li_8",
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
 )  # fmt: skip
 #: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-#: Rotation of a spinning body per force evaluation in the middle of the ladder.
+#: Rotation of a spinning body per force evaluation in the middle of the ladder, rad.
 RADIANS = 0.1
-#: The same for a body that does not turn, in steps of its scene, which are assumed to be suitable.
+#: Step of a body that does not rotate, in the step of its scene, which is assumed to be suitable.
 AT_REST = 8.0
 AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
 
-def precision(
-    scene: MolecularScene | BodyScene,
-    integrators: list[str] | None = None,
-    timesteps: list[float] | None = None,
-    span: float | None = None,
-    repeats: int = 3,
-    averages: float | None = None,
-    say: Callable[[float], object] = lambda share: None,
-) -> IntegratorAccuracy:
-    """Error against run time of integrators at time steps, on the start of a scene.
+def measure_accuracy(
+    scene: MolecularScene | BodyScene, integrators: list[str] | None = None, timesteps: list[float] | None = None,
+    span: float | None = None, repeats: int = 3, averages: float | None = None,
+    progress: Callable[[float], object] = lambda fraction: None,
+) -> IntegratorAccuracy:  # fmt: skip
+    """Error against run time of integrators at time steps, on the start of a scene. Raises SceneError.
 
-    integrators : names; default: the scene's own and those that suit it, the others are in `left_out`. rk4, dop853 and
-    radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion or _euler_angles sets another.
-    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost around the scene's own.
-    span : ps or s. averages : ps over which molecules' temperatures, energy and pressure are also averaged. Molecules
-    start where the last stage starts, after the earlier stages have run; no thermostat acts.
+    integrators : names; default: the scene's and those that suit it; the others are in `left_out`. rk4, dop853 and
+        radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion or _euler_angles sets another
+    timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost around the scene's
+    span : ps or s
+    averages : ps over which temperatures, energy and pressure of molecules are also averaged
+    progress : called with the fraction that is done; at 0, after all arguments have been checked
+
+    Molecules start where the last stage starts, after the earlier stages have run; no thermostat acts.
     """
-    check_is_at_home(scene)
+    check_engine_is_rigidmd(scene)
     known = (*SCHEMES, *COMPARATORS)
-    integrators = list(dict.fromkeys(_named(name, scene) for name in integrators or []))
+    integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
-        faults = [f"there is no {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown]
-        raise SceneError("--integrators", faults)
+        errors = [f"there is no {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown]
+        raise SceneError("--integrators", errors)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
-        raise SceneError("precision", ["time steps, span, averages and repeats must be finite and greater than 0"])
+        raise SceneError("accuracy", ["time steps, span, averages and repeats must be finite and greater than 0"])
     if isinstance(scene, MolecularScene) and (refused := [name for name in integrators if name in COMPARATORS]):
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
-    say(0.0)
+    progress(0.0)
     trial_system, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
     if averages and trial_system.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
@@ -64,22 +63,27 @@ def precision(
         raise SceneError(scene.source, reasons)
     left_out = {}
     if not integrators:
-        usual = USUAL if isinstance(scene, BodyScene) else [name for name in USUAL if name in SCHEMES]
-        left_out = {name: why for name, why in trial_system.refused.items() if name in usual}
-        left_out |= {name: AT_A_POLE for name in trial_system.singular if name in usual}
-        wanted = dict.fromkeys((*usual, _own(scene)))
-        integrators = [name for name in wanted if name in trial_system.methods and name not in left_out]
+        is_body = isinstance(scene, BodyScene)
+        defaults = [name for name in DEFAULT_INTEGRATORS if is_body or name in SCHEMES]
+        left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
+        left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
+        of_scene = _method_name(scene.run.integrator if is_body else scene.stages[-1].integrator, scene)
+        integrators = [
+            name
+            for name in dict.fromkeys((*defaults, of_scene))
+            if name in trial_system.methods and name not in left_out
+        ]
     steps = {
         name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
     }
-    found = measure(trial_system, plan(trial_system, steps), repeats, averages, say, not timesteps)
+    found = measure(trial_system, plan(trial_system, steps), repeats, averages, progress, not timesteps)
     found.left_out = left_out
     return found
 
 
-def _named(name: str, scene: MolecularScene | BodyScene) -> str:
-    """The method of a name on a scene."""
+def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
+    """The full name of a method: for solvers with the formulation of the scene, unless it is the matrix."""
     solver, _, form = name.partition("_")
     if solver in SOLVERS and isinstance(scene, BodyScene):
         form = form or scene.run.formulation
@@ -87,25 +91,20 @@ def _named(name: str, scene: MolecularScene | BodyScene) -> str:
     return name
 
 
-def _own(scene: MolecularScene | BodyScene) -> str:
-    """The scene's own method."""
-    return _named(scene.run.integrator if isinstance(scene, BodyScene) else scene.stages[-1].integrator, scene)
-
-
 def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSystem, float]:
-    """The subject, and the scene's time step per force evaluation (fs)."""
+    """The system, and the scene's time step per force evaluation (fs)."""
     last = scene.stages[-1]
     if last.is_minimisation:
-        raise SceneError(scene.source, ["the last stage is a minimisation: precision needs one in which time passes"])
+        raise SceneError(scene.source, ["the last stage is a minimisation: accuracy needs one in which time passes"])
     simulation, state = start_of_last_stage(scene)
     trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
-    trial_system.rounding = rounding(simulation.system, state)
-    own = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
-    return trial_system, last.timestep_fs / own
+    trial_system.rounding = single_precision_errors(simulation.system, state)
+    evaluations = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
+    return trial_system, last.timestep_fs / evaluations
 
 
 def _of_body(scene: BodyScene, span: float | None) -> tuple[TrialSystem, float]:
     """As `_of_molecules`, in s."""
     trial_system, speed = body_trial_system(scene, span)
-    own = SCHEMES[scene.run.integrator].force_evaluations if scene.run.integrator in SCHEMES else 1
-    return trial_system, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / own
+    evaluations = SCHEMES[scene.run.integrator].force_evaluations if scene.run.integrator in SCHEMES else 1
+    return trial_system, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations

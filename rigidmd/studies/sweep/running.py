@@ -1,4 +1,4 @@
-"""Running the points of a sweep: which comes next, what is written down, and how it is stopped."""
+"""Runs the points of a sweep: their order, the states in the manifest, wall time and signals."""
 
 import contextlib
 import signal
@@ -13,25 +13,24 @@ from rigidmd.run.checkpoints import checked_walltime
 from rigidmd.run.signals import handled
 from rigidmd.scene import Scene
 from rigidmd.studies.sweep.cluster import Cluster
-from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, Point, write_manifest
-from rigidmd.studies.sweep.plan import settle
+from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, SweepPoint, write_manifest
+from rigidmd.studies.sweep.plan import update_state
 from rigidmd.studies.sweep.processes import Message, Pool
-from rigidmd.studies.sweep.worker import Task
+from rigidmd.studies.sweep.worker import PointTask
 
-#: Seconds between two looks at the clock, and between two writings of the manifest.
-TICK, WRITING = 0.5, 1.0
-#: Of a wall time: seconds left for table and figure, and those that a point needs at least; not more than these shares.
+#: Seconds between two checks of the time, and between two writings of the manifest.
+TICK, WRITING_INTERVAL = 0.5, 1.0
+#: Seconds of a wall time for table and figure, and those that a point needs at least; at most these fractions of it.
 SPARE, LEAST = 10.0, 20.0
-SPARE_SHARE, LEAST_SHARE = 0.1, 0.2
+SPARE_FRACTION, LEAST_FRACTION = 0.1, 0.2
 
-
-#: Who runs points: processes here, or a cluster.
+#: Runs points: processes on this machine, or a cluster.
 Runner = Pool | Cluster
 
 
 @dataclass
-class Outcome:
-    """How a sweep ended. Names of points that finished now, that failed, that were finished before."""
+class SweepOutcome:
+    """How a sweep ended: names of points that finished, failed, had finished before, and are left."""
 
     finished: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -48,17 +47,17 @@ def run_points(
     runner: Runner,
     walltime: float | None = None,
     trust: Sequence[str] = (),
-    hear: Callable[[str, str, Any], object] = lambda name, kind, value: None,
-) -> Outcome:
+    receive: Callable[[str, str, Any], object] = lambda name, kind, value: None,
+) -> SweepOutcome:
     """Run what is not finished. A point waits while one that compiles the same code has not begun.
 
     walltime : seconds after which all has to have ended
     trust : Python files that the scene may run
-    hear : told (point, kind, value) of every `Message`
+    receive : called with (point, kind, value) of every `Message`
 
     Raises OutputError if the manifest cannot be written.
     """
-    began, found = clock.monotonic(), Outcome()
+    began, found = clock.monotonic(), SweepOutcome()
     by_name = {point.folder: point for point in manifest.points}
     found.skipped = [point.folder for point in manifest.points if point.state == FINISHED]
     waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
@@ -66,8 +65,8 @@ def run_points(
     busy: set[str] = set()
     ends_at, least = None, 0.0
     if walltime is not None:
-        ends_at = clock.time() + checked_walltime(walltime) - min(SPARE, SPARE_SHARE * walltime)
-        least = min(LEAST, LEAST_SHARE * walltime)
+        ends_at = clock.time() + checked_walltime(walltime) - min(SPARE, SPARE_FRACTION * walltime)
+        least = min(LEAST, LEAST_FRACTION * walltime)
     pressed = 0
 
     def stop(number: int) -> None:
@@ -80,7 +79,7 @@ def run_points(
             late = ends_at is not None and clock.time() + least > ends_at
             while found.signal is None and not late and runner.free and (point := waiting.next()):
                 busy.add(point.folder)
-                runner.give(task_of(folder, manifest, point, ends_at, trust))
+                runner.submit(task_of(folder, manifest, point, ends_at, trust))
             if not busy:
                 break
             if found.signal is not None:
@@ -89,7 +88,7 @@ def run_points(
                 if name not in busy:  # a cluster may deliver late
                     continue
                 if message.kind != "died" or found.signal is None:  # else it was stopped before its first step
-                    hear(name, *message)
+                    receive(name, *message)
                 point = by_name[name]
                 if message.kind == "begun":
                     waiting.compiled(point)
@@ -97,11 +96,11 @@ def run_points(
                 elif message.kind in ("ended", "died"):
                     busy.discard(name)
                     waiting.compiled(point)
-                    _note(folder, point, message, found)
+                    _store_end(folder, point, message, found)
                 else:
                     continue
                 changed = True
-            if changed and clock.monotonic() - written > WRITING:
+            if changed and clock.monotonic() - written > WRITING_INTERVAL:
                 write_manifest(folder, manifest)
                 changed, written = False, clock.monotonic()
     found.out_of_time |= found.signal is None and bool(waiting)
@@ -111,12 +110,12 @@ def run_points(
     return found
 
 
-def _note(folder: Path, point: Point, message: Message, found: Outcome) -> None:
-    """Write down how a point ended."""
+def _store_end(folder: Path, point: SweepPoint, message: Message, found: SweepOutcome) -> None:
+    """Store how a point ended."""
     if message.kind == "died":
-        if found.signal is not None:  # it was stopped before it could answer
+        if found.signal is not None:  # it was stopped before it sent its end
             point.state = INTERRUPTED
-            settle(folder, point)
+            update_state(folder, point)
         else:
             point.state, point.message = FAILED, message.value
     else:
@@ -129,9 +128,8 @@ def _note(folder: Path, point: Point, message: Message, found: Outcome) -> None:
 
 
 def task_of(
-    folder: Path, manifest: Manifest, point: Point, ends_at: float | None = None, trust: Sequence[str] = ()
-) -> Task:
-    """A point for a worker."""
+    folder: Path, manifest: Manifest, point: SweepPoint, ends_at: float | None = None, trust: Sequence[str] = ()
+) -> PointTask:
     return {
         "folder": str(folder.absolute()),
         "name": point.folder,
@@ -145,9 +143,9 @@ def task_of(
 
 
 class Waiting:
-    """Points that have not begun. Of those that compile the same code one goes first, so that it is compiled once."""
+    """Points that have not begun. One of those that compile the same code goes first, so that it is compiled once."""
 
-    def __init__(self, manifest: Manifest, points: list[Point]):
+    def __init__(self, manifest: Manifest, points: list[SweepPoint]):
         self._kinds: dict[str, str] = {}
         self._known: set[str] = set()  # kinds whose code is compiled
         self._first: str | None = None  # a point that compiles now
@@ -158,8 +156,7 @@ class Waiting:
     def __bool__(self) -> bool:
         return bool(self._queue)
 
-    def next(self) -> Point | None:
-        """The next point that may begin."""
+    def next(self) -> SweepPoint | None:
         for point in self._queue:
             known = self._kinds[point.folder] in self._known
             if known or self._first is None:
@@ -168,7 +165,7 @@ class Waiting:
                 return point
         return None
 
-    def compiled(self, point: Point) -> None:
+    def compiled(self, point: SweepPoint) -> None:
         """Note that a point has compiled its code, or will not any more."""
         self._known.add(self._kinds[point.folder])
         if self._first == point.folder:
@@ -176,7 +173,7 @@ class Waiting:
 
 
 def code_kind(scene: Scene) -> str:
-    """What decides the code that a scene compiles: its keys and words, without its numbers and files."""
+    """A text that is equal for scenes that compile the same code: keys and strings, without numbers and files."""
 
     def bare(value: Any) -> Any:
         match value:
@@ -189,6 +186,6 @@ def code_kind(scene: Scene) -> str:
             case _:
                 return [bare(inner) for inner in value]
 
-    from rigidmd.run.provenance import APART, keys_of, plain
+    from rigidmd.run.provenance import NOT_COMPARED, keys_of, plain
 
-    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *APART))))
+    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))))

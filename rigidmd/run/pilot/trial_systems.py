@@ -1,0 +1,275 @@
+"""Systems for pilot runs and for `rigidmd accuracy`: the start of a scene with every method that can move it.
+
+The functions `choose_for_...` apply `choice` to them for `integrator = "auto"`.
+"""
+
+import re
+from collections.abc import Callable
+from fractions import Fraction
+from math import ceil, gcd, inf, sqrt
+
+import numpy as np
+
+from rigidmd.assemble.body import build_body
+from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme
+from rigidmd.core.state import State
+from rigidmd.engines.body_motion import Motion, Snapshot, motion
+from rigidmd.engines.body_system import BodySystem, Pose
+from rigidmd.engines.observables import observe
+from rigidmd.engines.ode import SMALLEST_SINE
+from rigidmd.engines.system import System
+from rigidmd.errors import SceneError
+from rigidmd.run.pilot.choice import choose
+from rigidmd.run.pilot.trials import Method, TrialSystem
+from rigidmd.scene import BodyScene
+from rigidmd.scene.body import SAMPLES
+from rigidmd.scene.stage import Stage
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
+
+#: General ODE solvers for the textbook equations of a body, for comparison with the engine's schemes.
+COMPARATORS = {
+    solver if form == "matrix" else f"{solver}_{form}": (solver, form) for solver in SOLVERS for form in FORMULATIONS
+}
+SPAN_PS = 0.1
+#: Step of velocity Verlet and span of a pilot run, in radians of the mean vibration or libration.
+PILOT_STEP, PILOT_SPAN = 0.15, 10.0
+#: For an error of the energy over a stage a pilot run takes this part of the stage, at least these radians.
+PILOT_PART, LEAST_SPAN = 0.01, 3.0
+#: Samples and steps of the first run of a body, which only measures how fast it moves.
+COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
+
+
+def _on_rotor(name: str, rotor: str | None) -> Scheme:
+    """The scheme with the rotor of the scene if it supports it."""
+    scheme = SCHEMES[name]
+    return scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
+
+
+def natural_time(system: System, state: State) -> float | None:
+    """Time (ps) of one radian of the faster of vibration and libration; None at rest.
+
+    Its inverse squared is <F²/m> / <m v²>, the mean square frequency of a harmonic motion in equilibrium; likewise for
+    torques.
+    """
+    engine = system.engine()
+    load, _ = engine.evaluate(state)
+    mass, inverse = system.model.mass[system.model.species], system.model.inverse_mass[system.model.species]
+    rates = [_ratio((load.force**2).sum(axis=1) @ inverse, mass @ (state.velocity**2).sum(axis=1))]
+    if len(load.torque_body):
+        inverse = system.model.inverse_inertia[system.model.species]
+        rates.append(_ratio((load.torque_body**2 * inverse).sum(), (state.angular_momentum_body**2 * inverse).sum()))
+    return 1 / sqrt(max(rates)) if max(rates) > 0 else None
+
+
+def _ratio(a: float, b: float) -> float:
+    return float(a / b) if b > 0 else 0.0
+
+
+def molecular_trial_system(system: System, start: State, rotor: str | None, span: float) -> TrialSystem:
+    """Molecules that start at a state and run for `span` ps."""
+    state = start.copy()
+    state.step[:] = 0
+    state.begin_segment(0.0)
+    kinetic = observe(system, system.engine(), state).kinetic
+    freedom = max(system.freedom.total, 1)
+    thermal = 2 * kinetic / freedom
+    mass = system.model.mass[system.model.species]
+    boxed = system.space.volume < inf
+    conserved = system.model.keeps_momentum
+
+    def conserved_errors(now: State) -> dict[str, float]:
+        """Errors of the conserved components of the total momentum and, with neither box nor fields, of the angular
+        momentum, relative to the sums of their sizes."""
+        errors = {}
+        if conserved.any():
+            before, after = (mass[:, None] * velocity[:, conserved] for velocity in (state.velocity, now.velocity))
+            errors["momentum"] = _change(before, after)
+        if conserved.all() and not (boxed or system.external):
+            errors["L"] = _change(_angular_momenta(state, mass), _angular_momenta(now, mass))
+        return errors
+
+    return TrialSystem(
+        name=system.scene.name,
+        state=state,
+        methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
+        energy=lambda engine, now: observe(system, engine, now).energy - float(now.energy_ledger.sum()),
+        energy_unit="kT per degree of freedom",
+        energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
+        energy_size=freedom * thermal or 1.0,
+        kinetic=kinetic or 1.0,
+        span=span,
+        time_unit="fs",
+        time_size=FEMTOSECOND,
+        length_unit="Å",
+        reference="srkn_6",
+        conserved_errors=conserved_errors,
+        can_continue=True,
+        refused={name: "it is for single bodies" for name in COMPARATORS},
+        observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
+        molecules=len(system.model.species),
+        freedom=freedom,
+    )
+
+
+def _change(before: np.ndarray, after: np.ndarray) -> float:
+    """Change of the sum over molecules of vectors (n, 3), relative to the sum of their lengths."""
+    size = float(np.linalg.norm(before, axis=1).sum())
+    return float(np.linalg.norm((after - before).sum(axis=0))) / (size or 1.0)
+
+
+def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
+    """Angular momenta (n, 3) of molecules about the origin, lab frame."""
+    whole = np.cross(state.position, mass[:, None] * state.velocity)
+    if len(state.rotation):
+        whole += np.einsum("nij,nj->ni", state.rotation, state.angular_momentum_body)
+    return whole
+
+
+def body_trial_system(
+    scene: BodyScene, span: float | None = None, applied: dict[str, Callable[[Pose], tuple]] | None = None
+) -> tuple[TrialSystem, float]:
+    """A body for `span` s (default: its run, up to the first break), and its fastest rate of rotation (rad/s)."""
+    run = scene.run
+    keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
+    plain = dict.fromkeys(keys)
+    fits, refused = {}, {}
+    for name in (*SCHEMES, *COMPARATORS):
+        solver, form = COMPARATORS.get(name, (name, "matrix"))
+        formulation = None if form == "matrix" else form
+        try:
+            changed = run.model_copy(update=plain | {"integrator": solver, "formulation": formulation})
+            fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
+        except SceneError as error:
+            refused[name] = "; ".join(_reason(text, solver) for text in error.errors)
+    if not fits:
+        build_body(scene, applied)  # raises the error
+    system = fits["velocity_verlet"]
+    whole = min([span or run.duration_s, *system.breaks()])
+    seen = _coarse_motion(system, whole)
+    kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
+
+    def energy(engine, state) -> float:
+        now = motion(system, [Snapshot(float(state.time[0]), state)])
+        return float(now["energy"][0] - now["work"][0])
+
+    start = Snapshot(0.0, system.state)
+
+    def conserved_errors(state) -> dict[str, float]:
+        seen = motion(system, [start, Snapshot(float(state.time[0]), state)])
+        return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
+
+    methods = {
+        name: Method(
+            fit.engine, fit.method._replace(duration=whole) if name in COMPARATORS else _on_rotor(name, run.rotor)
+        )
+        for name, fit in fits.items()
+    }
+    schemes = [name for name in fits if name in SCHEMES]
+    at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
+    reference = max(schemes, key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations))
+    trial_system = TrialSystem(
+        name=scene.name,
+        state=system.state,
+        methods=methods,
+        energy=energy,
+        energy_unit="times the largest kinetic energy",
+        energy_note="",
+        energy_size=kinetic,
+        kinetic=kinetic,
+        span=whole,
+        time_unit="s",
+        time_size=1.0,
+        length_unit="m",
+        reference=reference,
+        conserved_errors=conserved_errors,
+        can_continue=False,
+        refused=refused,
+        singular=tuple(name for name, (_, form) in COMPARATORS.items() if form == "euler_angles" and at_a_pole),
+    )
+    speed = 0.0
+    if system.rotates:  # of the body, and of the nutation by its wheels
+        inertia, carried = system.moments(np.zeros(1))
+        spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
+        speed = max(spin, float(np.abs(carried).max() / inertia.max()))
+    return trial_system, speed
+
+
+def _reason(error: str, name: str) -> str:
+    """An error message about an integrator as a reason, without the advice."""
+    return re.split("[:;] use ", error.removeprefix("run: "))[0].replace(name, "it")
+
+
+def _coarse_motion(system: BodySystem, whole: float) -> Motion:
+    """The motion in this time, with coarse steps."""
+    engine = system.engine()
+    state = engine.begin(system.state, system.method)
+    snapshots, every = [Snapshot(0.0, state.copy())], COARSE_STEPS // COARSE_SAMPLES
+    for k in range(COARSE_SAMPLES):
+        engine.advance(state, system.method, whole / COARSE_STEPS, (k + 1) * every)
+        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
+    return motion(system, snapshots)
+
+
+def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, str]:
+    """Stage k with the integrator and step that are best from this state, and the reason. Raises SimulationError."""
+    stage = system.scene.stages[k]
+    natural = natural_time(system, state)
+    step = PILOT_STEP * natural / FEMTOSECOND if natural else stage.timestep_fs
+    span = PILOT_SPAN * natural if natural else SPAN_PS
+    if stage.energy_error_kT:
+        span = min(span, max(PILOT_PART * stage.duration, LEAST_SPAN / PILOT_SPAN * span))
+    trial_system = molecular_trial_system(system, state, None, span)
+    longest = {
+        name: float(f"{4 * step * scheme.force_evaluations:.3g}")
+        for name, scheme in SCHEMES.items()
+        if scheme.exact_rotor or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
+    }
+    targets = stage.energy_error_kT, stage.trajectory_error
+    integrator, timestep, reason = _choose_step(trial_system, longest, *targets, stage.duration)
+    return stage.with_integrator(integrator, timestep), reason
+
+
+#: Least fraction of a chosen step to which it is shortened to fit the interval of samples.
+MIN_STEP_FRACTION = 0.25
+
+
+def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None) -> tuple[BodyScene, str]:
+    """A scene with the best integrator and step, and the reason. Raises SimulationError."""
+    run = scene.run
+    trial_system, _ = body_trial_system(scene, applied=applied)
+    longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
+    integrator, timestep, reason = _choose_step(trial_system, longest, run.energy_error, run.trajectory_error)
+    chosen, timestep = timestep, _fit_step(timestep, run.duration_s, scene.output.interval_s)
+    fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
+    none = {"energy_error": None, "trajectory_error": None}
+    changed = run.model_copy(update={"integrator": integrator, "timestep_s": timestep} | none)
+    return scene.model_copy(update={"run": changed}), f"{integrator} at {chosen:g} s chosen{fitted}: {reason}"
+
+
+def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
+    """The longest step up to this one that divides the duration and the interval of samples; or the duration alone, if
+    the interval or their common divisor would make it much shorter. Each step is then a sample."""
+    if interval is not None and interval < MIN_STEP_FRACTION * timestep:
+        interval = duration
+    if interval is None:
+        interval = duration / SAMPLES if duration / SAMPLES >= timestep else duration
+    (a, b), (c, d) = (Fraction(repr(span)).as_integer_ratio() for span in (duration, interval))
+    common, longest = float(Fraction(gcd(a * d, c * b), b * d)), min(timestep, interval)
+    span = common if common >= MIN_STEP_FRACTION * longest else duration
+    return span / ceil(span / longest * (1 - 1e-9))
+
+
+def _choose_step(
+    trial_system: TrialSystem,
+    longest: dict[str, float],
+    energy: float | None,
+    trajectory: float | None,
+    duration: float | None = None,
+) -> tuple[str, float, str]:
+    if energy is not None:
+        found = choose(trial_system, energy, "energy_rms", longest, duration)
+    elif trajectory is not None:
+        found = choose(trial_system, trajectory, "trajectory_error", longest)
+    else:
+        raise ValueError("no error is asked for")
+    return found.integrator, found.timestep, found.reason
