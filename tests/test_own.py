@@ -404,13 +404,13 @@ def test_who_interacts_with_which_parameters():
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"k": 1.0}, "Kr": {"k": -4.0}}))
     with pytest.raises(SceneError, match=r"no site is 'Xe'; there are AR, argon.AR"):
         numbers(rigidmd.pair_law("k/r**9", {"Xe": {"k": 1.0}}))
-    with pytest.raises(SceneError, match=r"(?s)Ar: there is no k.*Ar: l is no parameter"):
+    with pytest.raises(SceneError, match=r"(?s)Ar: there is no k.*Ar: l is not a parameter"):
         numbers(rigidmd.pair_law("k/r**9", {"Ar": {"l": 1.0}}))
     with pytest.raises(SceneError, match="there is no k among its parameters"):
         numbers(rigidmd.pair_law("k/r**9 + l/r", {"l": 1.0}))
-    with pytest.raises(SceneError, match="mixing: q is no parameter"):
+    with pytest.raises(SceneError, match="mixing: q is not a parameter"):
         numbers(rigidmd.pair_law("k/r**9", both, mixing={"q": "arithmetic"}))
-    with pytest.raises(SceneError, match="is there twice"):
+    with pytest.raises(SceneError, match="is given twice"):
         numbers(rigidmd.pair_law("k/r**9", pairs={("AR", "KR"): {"k": 1.0}, ("KR", "AR"): {"k": 2.0}}))
     with pytest.raises(SceneError, match="switch_start_A would do nothing"):
         numbers(rigidmd.pair_law("k/r**9", both, truncation="shift", switch_start_A=7.0))
@@ -547,11 +547,11 @@ class Faulty(rigidmd.Force):
     "way, word",
     [
         ("raises", r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_own.py"),
-        ("shape", r"the force faulty gave forces of the shape \(3,\), not \(100, 3\)"),
-        ("energy", "gave 'much' as its energy"),
-        ("tuple", "gave ndarray; it must give a tuple"),
-        ("virial", r"gave \[1.0, 2.0\] as its virial"),
-        ("nan", r"stopped at step \d \(.* ps\): the force faulty gave .*nan.* on molecule 7 \(dot\)"),
+        ("shape", r"the force faulty returned forces of the shape \(3,\), not \(100, 3\)"),
+        ("energy", "returned 'much' as its energy"),
+        ("tuple", "returned ndarray; it must return a tuple"),
+        ("virial", r"returned \[1.0, 2.0\] as its virial"),
+        ("nan", r"stopped at step \d \(.* ps\): the force faulty returned .*nan.* on molecule 7 \(dot\)"),
     ],
 )
 def test_a_faulty_force_is_told_with_its_molecule_and_step(way, word):
@@ -610,7 +610,7 @@ class Halfway(Spring):
         (Leaving(), "SystemExit: 0"),
         (Halfway(), "must be three truth values"),
         (Neither(), "must define one of on_sites and on_molecules"),
-        (lambda state: 0.0, "is no force"),
+        (lambda state: 0.0, "is not a force"),
     ],
 )
 def test_a_force_that_is_not_what_its_energy_says_stops_the_run_with_the_numbers(force, word):
@@ -695,7 +695,7 @@ def test_a_file_of_code_runs_only_where_it_is_trusted(tmp_path, monkeypatch, cap
         (MINE, {"name": "tarp"}, "has no tarp; did you mean .*trap"),
         (MINE, {"name": "trap"}, r"trap\(...\) raised TypeError"),
         (MINE, {"name": "ready", "parameters": {"k": 1.0}}, "parameters would do nothing"),
-        ("x = 3", {"name": "x"}, "3 is no force"),
+        ("x = 3", {"name": "x"}, "3 is not a force"),
     ],
 )
 def test_a_file_that_is_no_use_is_told(text, entry, word, tmp_path):

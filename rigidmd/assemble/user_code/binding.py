@@ -142,41 +142,37 @@ def user_terms(system: "System") -> UserTerms:
 
 
 def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTuple:
-    """The term of one object. Raises LawError, ValueError, OwnError."""
+    """The term of one object. Raises PairPotentialError, ValueError, UserForceError."""
     if isinstance(made, PairLaw):
-        law = made.bind(system)
-        if law.formula.error:
-            found.notes.append(f"{name}: the error of its spline is {law.formula.error:.1e} of its deepest energy")
-        found.notes.extend(f"{name}: {note}" for note in law.notes)
-        if law.tail is not None:
-            found.tails.append(law.tail)
-        cutoff = made.cutoff_A or system.cutoff
-        reach = (
-            f"cutoff {cutoff:g} Å, {made.truncation or system.scene.forces.truncation}" if cutoff < inf else "no cutoff"
-        )
-        found.words[name] = f"{law.formula.text}, {len(law.term.group)} sites, {reach}"
-        return law.term
+        potential = made.bind(system)
+        if error := potential.formula.error:
+            found.notes.append(f"{name}: the error of its spline is {error:.1e} of its deepest energy")
+        found.notes.extend(f"{name}: {note}" for note in potential.notes)
+        if potential.tail is not None:
+            found.tails.append(potential.tail)
+        cutoff, truncation = made.cutoff_A or system.cutoff, made.truncation or system.scene.forces.truncation
+        reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
+        found.descriptions[name] = f"{potential.formula.text}, {len(potential.term.group)} sites, {reach}"
+        return potential.term
     if isinstance(made, Force):
         bound = BoundForce(made, name, system)
         found.python_forces[name] = bound
-        found.words[name] = f"{type(made).__qualname__}, computed by Python"
+        found.descriptions[name] = f"{type(made).__qualname__}, computed by Python"
         return bound.term
     if hasattr(made, "term"):
         try:
             made = made.term(system)
         except (ValueError, SceneError):
             raise
-        except (Exception, SystemExit) as error:  # whatever a stranger's code raises
+        except (Exception, SystemExit) as error:  # user code may raise anything
             raise ValueError(f"term(system) raised {describe_error(error)}") from error
-    if isinstance(made, PairForces):  # of a law that is not a `PairLaw`
-        check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every law has a cutoff
+    if isinstance(made, PairForces):  # with a potential that is not a `PairLaw`
+        check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every pair potential has a cutoff
     if not (isinstance(made, PairForces) or type(made) in FORCES):
         raise ValueError(
-            f"{made!r:.80} is no force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "
+            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "
             "rigidmd.compiled_force, or an object whose term(system) makes one"
         )
-    numbers = ", ".join(
-        f"{key} = {value:.6g}" for key, value in made._asdict().items() if isinstance(value, int | float)
-    )
-    found.words[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
+    numbers = ", ".join(f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float))
+    found.descriptions[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
     return made

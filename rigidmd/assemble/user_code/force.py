@@ -86,18 +86,17 @@ class BoundForce:
         self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
 
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
-        """Fill a workspace with the forces at a state. Raises OwnError."""
+        """Fill a workspace with the forces at a state. Raises UserForceError."""
         state = State(*(_read_only(array) for array in state))
         if self._by_site:
             position = _read_only(self.system.site_positions(state))
             energy, force, torque, virial = self._of_sites(position, state)
         else:
             energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, state), 4)
-        shape = workspace.force.shape
-        self._fill(workspace.force, force, "forces", shape)
-        self._fill(workspace.torque_body, torque, "torques", workspace.torque_body.shape)
+        self._fill(workspace.force, force, "forces")
+        self._fill(workspace.torque_body, torque, "torques")
         if not np.isfinite(energy):
-            raise UserForceError(f"the force {self.name} gave the energy {energy}")
+            raise self._error(f"the energy {energy}")
         workspace.tally[0] = energy * KJ_PER_MOL
         workspace.tally[1:] = self._virial(virial)
         workspace.fresh[0] = 1
@@ -106,15 +105,15 @@ class BoundForce:
         """A virial (9,), u Å²/ps²; None is 0."""
         virial = np.zeros((3, 3)) if given is None else _numbers(given)
         if virial is None or virial.shape != (3, 3) or not np.isfinite(virial).all():
-            raise UserForceError(f"the force {self.name} gave {given!r:.60} as its virial, not (3, 3) finite numbers")
+            raise self._error(f"{given!r:.60} as its virial, not (3, 3) finite numbers")
         return KJ_PER_MOL * virial.ravel()
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
         system = self.system
         energy, force, virial, _ = self._parts(self._called("on_sites", self.force.on_sites, position, state), 3)
         on_sites = np.zeros(position.shape)
-        self._fill(on_sites, force, "forces", position.shape, system.sites.molecule, 1.0)
         molecule = system.sites.molecule
+        self._fill(on_sites, force, "forces", molecule, 1.0)
         total = np.zeros((len(state.velocity), 3))
         np.add.at(total, molecule, on_sites)
         torque = None
@@ -129,36 +128,34 @@ class BoundForce:
         if not isinstance(found, tuple) or not 2 <= len(found) <= most:
             given = f"{len(found)} values" if isinstance(found, tuple) else f"{type(found).__name__}"
             more = " and perhaps torques and a virial" if most == 4 else " and perhaps a virial"
-            raise UserForceError(f"the force {self.name} gave {given}; it must give a tuple of an energy, forces{more}")
+            raise self._error(f"{given}; it must return a tuple of an energy, forces{more}")
         try:
             energy = float(found[0])
         except (TypeError, ValueError):
-            raise UserForceError(f"the force {self.name} gave {found[0]!r:.60} as its energy, not a number") from None
+            raise self._error(f"{found[0]!r:.60} as its energy, not a number") from None
         return [energy, *found[1:], *[None] * (4 - len(found))]
 
     def _fill(
-        self, room: np.ndarray, given: Any, what: str, shape: tuple, molecule: np.ndarray | None = None,
-        size: float = KJ_PER_MOL,
-    ) -> None:  # fmt: skip
-        """Copy an array into its room; None is 0."""
+        self, target: np.ndarray, given: Any, what: str, molecule: np.ndarray | None = None, unit: float = KJ_PER_MOL
+    ) -> None:
+        """Copy given values times a unit to an array of the workspace; None is 0."""
         if given is None:
-            room[:] = 0.0
+            target[:] = 0.0
             return
         array = _numbers(given)
         if array is None:
-            raise UserForceError(
-                f"the force {self.name} gave {given!r:.60} as {what}, not real numbers of the shape {shape}"
-            )
-        if array.shape != shape:
-            raise UserForceError(f"the force {self.name} gave {what} of the shape {array.shape}, not {shape}")
+            raise self._error(f"{given!r:.60} as {what}, not real numbers of the shape {target.shape}")
+        if array.shape != target.shape:
+            raise self._error(f"{what} of the shape {array.shape}, not {target.shape}")
         if not np.isfinite(array).all():
             row = int(np.argmin(np.isfinite(array).all(axis=1)))
-            of = row if molecule is None else int(molecule[row])
-            which = f"molecule {of + 1} ({self.system.species[self.system.model.species[of]].name})"
-            raise UserForceError(
-                f"the force {self.name} gave {array[row]} as {what} on {which}, which is no finite number"
-            )
-        room[:] = size * array
+            k = row if molecule is None else int(molecule[row])
+            which = f"molecule {k + 1} ({self.system.species[self.system.model.species[k]].name})"
+            raise self._error(f"{array[row]} as {what} on {which}, which are not finite numbers")
+        target[:] = unit * array
+
+    def _error(self, what: str) -> UserForceError:
+        return UserForceError(f"the force {self.name} returned {what}")
 
     def _called(self, what: str, function: Callable, *arguments: Any) -> Any:
         try:

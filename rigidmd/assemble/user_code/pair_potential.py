@@ -1,4 +1,4 @@
-"""Laws between pairs of sites that users give: which sites they act on, with which parameters, and how they end."""
+"""Pair potentials of users: the sites that they act on, their parameters and their cutoff schemes."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 Rule = Literal["geometric", "arithmetic", "harmonic"]
 RULES: tuple[str, ...] = get_args(Rule)
 Parameters = Mapping[str, float]
-#: Cutoffs within which a minimum is looked for.
+#: A minimum is searched up to this multiple of the cutoff.
 REACH = 20.0
-#: A table of a single law: distances (Å) and energies (kJ/mol).
+#: A tabulated potential: distances (Å) and energies (kJ/mol).
 Columns = tuple[Sequence[float], Sequence[float]]
 
 
 class PairPotentialError(ValueError):
-    """What is wrong with a pair law in a scene, as sentences."""
+    """Errors of a pair potential in a scene."""
 
     def __init__(self, *errors: str):
         self.errors = list(errors)
@@ -47,7 +47,7 @@ class PairPotentialError(ValueError):
 
 @dataclass(frozen=True)
 class PairLaw:
-    """A law between pairs of sites, for `Simulation(scene, forces=[...])`; see `pair_law`, which makes it."""
+    """A pair potential for `Simulation(scene, forces=[...])`, made by `pair_law`."""
 
     energy: "str | Callable | None"
     table: Columns | None
@@ -63,19 +63,19 @@ class PairLaw:
     formula_of_function: Formula | None = field(default=None, repr=False)
 
     def formula(self, cutoff: float) -> Formula:
-        """The formula that it is compiled from. Raises LawError."""
+        """The formula that is compiled. Raises PairPotentialError."""
         try:
             if self.table is not None:
                 return formula_of_table(*self.table, cutoff)
             if isinstance(self.energy, str):
                 return formula_of_text(self.energy, self.constants)
-            assert self.formula_of_function is not None  # a law has a text, a function or a table
+            assert self.formula_of_function is not None  # it has a text, a function or a table
             return self.formula_of_function
         except FormulaError as error:
             raise PairPotentialError(str(error)) from None
 
     def bind(self, system: "System") -> "BoundPotential":
-        """The law between the sites of a system. Raises LawError with every fault."""
+        """The potential between the sites of a system. Raises PairPotentialError with all errors."""
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
@@ -87,29 +87,29 @@ class PairLaw:
         if not start <= cutoff:
             raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
         formula = self.formula(cutoff)
-        kinds = _SiteTypes(self, formula, system.species)
-        chosen = [np.flatnonzero([entry is not None for entry in of]) for of in kinds.of_species]
+        types = _SiteTypes(self, formula, system.species)
+        chosen = [np.flatnonzero([entry is not None for entry in of]) for of in types.of_species]
         if not any(len(own) for own in chosen):
-            raise PairPotentialError("no site of the scene takes part in it")
+            raise PairPotentialError("no site of the scene has its parameters")
         index = system.model.species
         offsets = [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)]
         sites = sites_of(index, offsets, system.model.inverse_inertia)
-        numbers_of = [[kinds.number[entry] for entry in of if entry is not None] for of in kinds.of_species]
+        numbers_of = [[types.number[entry] for entry in of if entry is not None] for of in types.of_species]
         kind = gather_per_molecule([np.array(own, int) for own in numbers_of], index)
         shape = truncation_of(name, cutoff, start)
-        count = len(kinds.all)
+        count = len(types.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
         ends, acts = np.zeros((4, count, count)), np.zeros((count, count))
         members, beyond = np.bincount(kind, minlength=count), Tail(0.0, 0.0)
         faults: list[str] = []
         short: list[tuple[float, str]] = []
-        for i, j, of_pair in kinds.pairs(faults):
+        for i, j, of_pair in types.pairs(faults):
             try:
                 numbers[:, i, j], radial = formula.numbers(of_pair), formula.radial(of_pair)
                 ends[:, i, j] = truncation_terms(name, shape, radial)
                 values = [] if cutoff == inf else [*radial(cutoff), *radial(0.9 * cutoff)]
                 if forces.tail_correction and formula.shared:
-                    raise FormulaError("a table ends, and says nothing for forces.tail_correction")
+                    raise FormulaError("a table is finite, and forces.tail_correction needs its energy beyond")
                 if forces.tail_correction:
                     part, pairs = tail_of_pair(radial, ends[:, i, j], shape), float(members[i] * members[j])
                     pairs *= 1.0 if i == j else 2.0
@@ -117,10 +117,10 @@ class PairLaw:
                 if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
                     raise FormulaError("it has no finite value at the cutoff")
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
-                faults.append(f"between {kinds.words(i)} and {kinds.words(j)}: {error}")
+                faults.append(f"between {types.example(i)} and {types.example(j)}: {error}")
             else:
                 if minimum := _minimum_beyond(cutoff, radial):
-                    short.append((minimum, f"{kinds.words(i)} and {kinds.words(j)}"))
+                    short.append((minimum, f"{types.example(i)} and {types.example(j)}"))
             numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
             acts[i, j] = acts[j, i] = 1.0
         if faults:
@@ -128,14 +128,14 @@ class PairLaw:
         if not acts.any():
             raise PairPotentialError("no pair of sites of the scene has parameters")
         first = np.argwhere(acts)[0]
-        law = CustomPotential(
+        potential = CustomPotential(
             cutoff, shape, formula.kind(*(float(x) for x in numbers[:, first[0], first[1]])), formula.shared,
             kind.astype(np.int32), np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]), ends,
             acts,
         )  # fmt: skip
         frozen = (system.model.inverse_mass == 0)[index]
         return BoundPotential(
-            pair_forces(law, sites, exclusion_groups(sites, frozen)),
+            pair_forces(potential, sites, exclusion_groups(sites, frozen)),
             formula,
             beyond if forces.tail_correction else None,
             [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else [],
@@ -159,113 +159,114 @@ def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | 
 
 
 def check_cutoff(cutoff: float, system: "System") -> None:
-    """Raise LawError unless the box is large enough for a law's cutoff (Å)."""
+    """Raise PairPotentialError unless the box is large enough for a cutoff (Å)."""
     half = min(system.space.edges) / 2
     if cutoff == inf and system.space.volume < inf:
-        raise PairPotentialError("it has no cutoff, and the box is periodic: a law in a box needs one (cutoff_A)")
+        raise PairPotentialError("it has no cutoff, and the box is periodic: set cutoff_A")
     if not cutoff <= half:
         raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
 
 
 class BoundPotential(NamedTuple):
-    """A law in a system."""
+    """A pair potential in a system."""
 
     term: PairForces
     formula: Formula
-    tail: Tail | None  # what the cutoff takes away, where the scene asks for it
+    tail: Tail | None  # correction for the cutoff, if the scene has forces.tail_correction
     notes: list[str]
 
 
 class _SiteTypes:
-    """Kinds of sites that a law tells apart: their parameters, and the entries of `pairs` that mean them."""
+    """Types of sites: a type has the same parameters and is in the same entries of `pairs`."""
 
-    def __init__(self, law: PairLaw, formula: Formula, species: list[Molecule]):
-        self._law, self._formula = law, formula
-        known = dict.fromkeys(name for m in species for own in m.site_names for name in (own, f"{m.name}.{own}"))
+    def __init__(self, potential: PairLaw, formula: Formula, species: list[Molecule]):
+        self._potential, self._formula = potential, formula
+        known = dict.fromkeys(name for m in species for site in m.site_names for name in (site, f"{m.name}.{site}"))
         known |= dict.fromkeys(e for m in species for e in m.elements)
-        listed = [*(law.of_sites or {}), *law.sites, *(name for pair in law.pairs for name in pair)]
+        listed = [*(potential.of_sites or {}), *potential.sites, *(name for pair in potential.pairs for name in pair)]
         there = f"; there are {', '.join(known)}"
-        self._meant = {name: sites_named(species, name) for name in listed}
+        self._named = {name: sites_named(species, name) for name in listed}
         faults = [
             f"no site is {name!r}{did_you_mean(name, list(known)) or there}"
-            for name, of in self._meant.items()
-            if not any(own.any() for own in of)
+            for name, sites in self._named.items()
+            if not any(mask.any() for mask in sites)
         ]
-        self._needed = [name for name in formula.parameters if name not in law.constants and not formula.shared]
-        for where, own in [*(law.of_sites or {}).items(), *(("-".join(k), v) for k, v in law.pairs.items())]:
-            faults += [f"{where}: there is no {name}" for name in self._needed if name not in own]
-            faults += [f"{where}: {self._unknown(name)}" for name in own if name not in formula.parameters]
-        if law.of_sites == {} and not law.pairs:
+        self._needed = [name for name in formula.parameters if name not in potential.constants and not formula.shared]
+        of_pairs = {"-".join(pair): given for pair, given in potential.pairs.items()}
+        for where, given in [*(potential.of_sites or {}).items(), *of_pairs.items()]:
+            faults += [f"{where}: there is no {name}" for name in self._needed if name not in given]
+            faults += [f"{where}: {self._unknown(name)}" for name in given if name not in formula.parameters]
+        if potential.of_sites == {} and not potential.pairs:
             faults += [f"there is no {name} among its parameters" for name in self._needed]
-        faults += [self._unknown(name) for name in law.constants if not _has(law.energy, formula, name)]
-        faults += [f"mixing: {self._unknown(name)}" for name in law.mixing if name not in formula.parameters]
+        faults += [self._unknown(name) for name in potential.constants if not _has(potential.energy, formula, name)]
+        faults += [f"mixing: {self._unknown(name)}" for name in potential.mixing if name not in formula.parameters]
         faults += [
-            f"pairs: {'-'.join(pair)} is there twice"
-            for pair in law.pairs
-            if pair[0] < pair[1] and pair[::-1] in law.pairs
+            f"pairs: {'-'.join(pair)} is given twice"
+            for pair in potential.pairs
+            if pair[0] < pair[1] and pair[::-1] in potential.pairs
         ]
         if faults:
             raise PairPotentialError(*faults)
         self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
-        self.all = sorted({entry for of in self.of_species for entry in of if entry is not None}, key=repr)
+        self.all = sorted({entry for sites in self.of_species for entry in sites if entry is not None}, key=repr)
         self.number = {entry: k for k, entry in enumerate(self.all)}
         self._first = {
             entry: f"{m.name}.{m.site_names[i]}"
-            for m, of in reversed(list(zip(species, self.of_species, strict=True)))
-            for i, entry in reversed(list(enumerate(of)))
+            for m, sites in reversed(list(zip(species, self.of_species, strict=True)))
+            for i, entry in reversed(list(enumerate(sites)))
             if entry is not None
         }
 
     def _unknown(self, name: str) -> str:
         known = ", ".join(self._formula.parameters) or "none"
-        return f"{name} is no parameter of {self._formula.text!r}; there are {known}"
+        return f"{name} is not a parameter of {self._formula.text!r}; there are {known}"
 
-    def words(self, k: int) -> str:
-        """A site of a kind."""
+    def example(self, k: int) -> str:
+        """A site of a type, for messages."""
         return self._first[self.all[k]]
 
     def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
-        """Parameters of a site and the sides of `pairs` that it is on; None if it takes no part."""
-        law = self._law
-        own = self._parameters(k, m, i)
-        sides = tuple(bool(self._meant[name][k][i]) for pair in law.pairs for name in pair)
-        if own is None and not any(sides):
+        """Parameters of a site, and whether it is each site of `pairs`; None if the potential does not act on it."""
+        potential = self._potential
+        given = self._parameters(k, m, i)
+        sides = tuple(bool(self._named[name][k][i]) for pair in potential.pairs for name in pair)
+        if given is None and not any(sides):
             return None
-        return (None if own is None else tuple(sorted(own.items()))), sides
+        return (None if given is None else tuple(sorted(given.items()))), sides
 
     def _parameters(self, k: int, m: Molecule, i: int) -> Parameters | None:
-        law = self._law
-        if law.sites and not any(self._meant[name][k][i] for name in law.sites):
+        potential = self._potential
+        if potential.sites and not any(self._named[name][k][i] for name in potential.sites):
             return None
-        if law.of_sites is None:
+        if potential.of_sites is None:
             if self._formula.shared:
-                return {"scale": 1.0} if not law.pairs else None
-            own = m.parameters[i]
-            return {name: own[name] for name in self._needed} if all(name in own for name in self._needed) else None
-        if not law.of_sites:
-            return {} if not law.pairs else None
-        named = [name for name in law.of_sites if self._meant[name][k][i]]
+                return {"scale": 1.0} if not potential.pairs else None
+            given = m.parameters[i]
+            return {name: given[name] for name in self._needed} if all(name in given for name in self._needed) else None
+        if not potential.of_sites:
+            return {} if not potential.pairs else None
+        named = [name for name in potential.of_sites if self._named[name][k][i]]
         ranked = (f"{m.name}.{m.site_names[i]}", f"{m.name}.{m.elements[i]}", m.site_names[i], m.elements[i])
-        return next((law.of_sites[name] for name in ranked if name in named), None)
+        return next((potential.of_sites[name] for name in ranked if name in named), None)
 
     def pairs(self, faults: list[str]) -> Iterator[tuple[int, int, dict[str, float]]]:
-        """Numbers i <= j of two kinds, and the parameters between them, of those that interact."""
-        for i, (own, sides) in enumerate(self.all):
+        """Numbers i <= j of two types that interact, and the parameters between them."""
+        for i, (given, sides) in enumerate(self.all):
             for j, (other, others) in enumerate(self.all[i:], i):
                 found = None
-                for n, values in enumerate(self._law.pairs.values()):
+                for n, values in enumerate(self._potential.pairs.values()):
                     if (sides[2 * n] and others[2 * n + 1]) or (sides[2 * n + 1] and others[2 * n]):
                         found = {"scale": 1.0} | dict(values) if self._formula.shared else dict(values)
-                if found is None and own is not None and other is not None:
-                    found = self._mixed(dict(own), dict(other), i, j, faults)
+                if found is None and given is not None and other is not None:
+                    found = self._mixed(dict(given), dict(other), i, j, faults)
                 if found is not None:
-                    yield i, j, dict(self._law.constants) | found
+                    yield i, j, dict(self._potential.constants) | found
 
-    def _mixed(self, own: dict, other: dict, i: int, j: int, faults: list[str]) -> dict[str, float] | None:
+    def _mixed(self, given: dict, other: dict, i: int, j: int, faults: list[str]) -> dict[str, float] | None:
         found = {}
-        for name, a in own.items():
+        for name, a in given.items():
             b = other[name]
-            rule = self._law.mixing.get(name) or ("arithmetic" if name.lower().startswith("sig") else "geometric")
+            rule = self._potential.mixing.get(name) or ("arithmetic" if name.lower().startswith("sig") else "geometric")
             if a == b:
                 found[name] = a
             elif rule == "arithmetic":
@@ -276,7 +277,7 @@ class _SiteTypes:
                 found[name] = 2 * a * b / (a + b)
             else:
                 faults.append(
-                    f"{name} of {self.words(i)} and {self.words(j)}, {a:g} and {b:g}, have no {rule} mean: "
+                    f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no {rule} mean: "
                     f"give {name} of that pair in pairs, or another rule in mixing"
                 )
                 return None
@@ -284,7 +285,7 @@ class _SiteTypes:
 
 
 def _has(energy: Any, formula: Formula, name: str) -> bool:
-    """Whether a formula has a parameter, which may have become a number of it."""
+    """Whether a formula contains a parameter, which may have been replaced by its number."""
     return name in formula.parameters or (isinstance(energy, str) and name in re.findall(r"[^\W\d]\w*", energy))
 
 
@@ -294,7 +295,7 @@ def pair_law(
     mixing: Mapping[str, Rule] | None = None, truncation: TruncationName | None = None, cutoff_A: float | None = None,
     switch_start_A: float | None = None, name: str = "",
 ) -> PairLaw:  # fmt: skip
-    """A law between pairs of sites of different molecules, for `Simulation(scene, forces=[...])`.
+    """A pair potential between sites of different molecules, for `Simulation(scene, forces=[...])`.
 
     rigidmd.pair_law("A*exp(-B*r) - C/r**6", {"Ar": {"A": 1.6e6, "B": 4.4, "C": 6.2e3}})
 
@@ -317,9 +318,8 @@ def pair_law(
     if (energy is None) == (table is None):
         raise ValueError("a pair law needs an energy or a table")
     if truncation is not None and truncation not in TRUNCATIONS:
-        raise ValueError(
-            f"truncation is {truncation!r}{did_you_mean(truncation, TRUNCATIONS) or ''}; there are {', '.join(TRUNCATIONS)}"
-        )
+        hint = did_you_mean(truncation, TRUNCATIONS)
+        raise ValueError(f"truncation is {truncation!r}{hint}; there are {', '.join(TRUNCATIONS)}")
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
