@@ -40,14 +40,14 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F6", "paths without what a barostat scaled: the cell is transposed",
-        "analysis/history.py",
+        "analysis/rigid_frames.py",
         "        inside = np.einsum(\"fni,fij->fnj\", self.positions, np.linalg.inv(self.cell))",
         "        inside = np.einsum(\"fni,fji->fnj\", self.positions, np.linalg.inv(self.cell))",
         ("test_analyse.py::test_scaling_the_box_moves_nothing",),
     ),
     Mutation(
         "F7", "wrapped frames of a cell that changes are unwrapped with the first cell",
-        "analysis/history.py",
+        "analysis/rigid_frames.py",
         "        inside = np.einsum(\"fni,fij->fnj\", position, np.linalg.inv(cells))",
         "        inside = np.einsum(\"fni,ij->fnj\", position, np.linalg.inv(cells[0]))",
         ("test_analyse.py::test_paths_are_unwrapped_by_the_cell_of_each_frame",),
@@ -125,7 +125,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F18", "a structure whose cell is turned: its velocities are not",
         "assemble/structure.py",
-        "velocity = None if atoms.velocity is None else atoms.velocity @ turn.T",
+        "velocity = None if atoms.velocity is None else atoms.velocity @ rotation.T",
         "velocity = atoms.velocity",
         ("test_structures.py::test_a_turned_cell_turns_velocities_too",),
     ),

@@ -20,7 +20,7 @@ import numpy as np
 
 import rigidmd
 from rigidmd import BodyScene, Scene
-from rigidmd.analysis.history import History
+from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
 from rigidmd.core.integrators import Scheme
@@ -186,7 +186,7 @@ def history(
     cell = NO_CELL if cell is None else np.asarray(cell)
     if positions is None:
         positions = np.zeros((f, n, 3))
-    return History(
+    return RigidFrames(
         system, system.scene.stages[-1], np.asarray(time), np.broadcast_to(cell, (f, 3, 3)), positions,
         np.empty((f, 0, 3, 3)) if Q is None else Q, velocities, L, {"temperature": np.full(f, temperature)}, tensor,
     )  # fmt: skip
@@ -208,21 +208,20 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
+    "analysis.result": "Curve AnalysisResult Value converged_value",
+    "analysis.rigid_frames": "fit_frames",
     "io.bonds": "bonds connections",
     "dynamics.model": "Model",
     "run.pilot.trial_systems": "COMPARATORS _fit_step body_trial_system molecular_trial_system",
     "run.rigid_fit": "kinds_of",
     "figures.run": "energy_figure",
-    "analysis.folder": "Task analyse_folder",
     "analysis.correlation": "correlation squared_displacement",
     "analysis.permittivity": "dielectric total_dipole",
-    "analysis.files": "ANALYSIS read_findings",
-    "analysis.findings": "Curve Finding Value settled",
+    "analysis.files": "ANALYSIS AnalysisRequest analyse_folder read_results",
     "analysis.shear_viscosity": "viscosity",
-    "analysis.history": "rebuilt",
     "analysis.translation": "MPA_S NM2_PER_S diffusion msd",
     "studies.sweep.replicas": "over_replicas",
-    "analysis.source": "_evened of_folder steady_from",
+    "analysis.source": "_without_rounding frames_of_folder steady_from",
     "analysis.structure": "density_profile hydrogen_bonds rdf structure_factor",
     "analysis.rotation": "PER_CM orientation spectrum",
     "io.atoms": "Frame element_of element_of_mass",
@@ -326,7 +325,7 @@ HOMES = {
     "run.report": "summary_text",
     "io.run_files": "Summary read_json",
     "io.scene_file": "write_scene",
-    "studies.sweep.folder": "Manifest Point point_name read_manifest short_keys value_name write_manifest",
+    "studies.sweep.folder": "Manifest SweepPoint point_name read_manifest short_keys value_name write_manifest",
     "io.trajectory": "from_files in_memory read_frames",
     "io.trajectory_writer": "GsdFile TrajectoryFile open_trajectory write_topology",
     "engines.rigid_bodies": "RigidBodies",
@@ -357,8 +356,8 @@ HOMES = {
     "studies.sweep.cluster": "Cluster",
     "studies.sweep.processes": "Pool",
     "studies.sweep.running": "Waiting code_kind run_points",
-    "studies.sweep.slurm": "in_hours in_ranges write_script",
-    "studies.sweep.table": "Row measured",
+    "studies.sweep.slurm": "format_ranges format_walltime write_script",
+    "studies.sweep.table": "SweepRow summarise_run",
     "studies.verify": "verify",
 }
 
@@ -367,7 +366,7 @@ RENAMED = {
     "BATH_STEP": "core.integrators:THERMOSTAT",
     "SAMPLE_NUMBERS": "engines.samples:NUMBERS",
     "SHIPPED": "scene.shipped:SYSTEMS",
-    "analysis_drawn": "analysis.files:drawn",
+    "draw_analysis_curve": "analysis.files:draw_curve",
     "averages_failures": "studies.accuracy.averages_report:describe_failures",
     "axis_settings": "studies.sweep.axes:settings",
     "gromacs_unsupported": "engines.gromacs.files:unsupported_features",

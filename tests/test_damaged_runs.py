@@ -14,7 +14,7 @@ from support import (
     Point,
     Summary,
     compare,
-    read_findings,
+    read_results,
     read_json,
     read_manifest,
     read_record,
@@ -161,7 +161,7 @@ def test_any_value_of_an_analysis(argon, tmp_path):
     found = [0, 0]
     for path, text in chosen.sample(every, min(len(every), 300)):
         (folder / ANALYSIS).write_text(replaced(data, path, text))
-        found[taken(read_findings, folder)] += 1
+        found[taken(read_results, folder)] += 1
     assert min(found) > 5
 
 
@@ -183,7 +183,7 @@ def test_any_cell_of_a_table(which, name, request, tmp_path):
     source = request.getfixturevalue(which)
     folder, text = copied(source, tmp_path), (source / name).read_text()
     lines, chosen = text.splitlines(), random.Random(3)
-    read = read_findings if name == "rdf.csv" else read_record
+    read = read_results if name == "rdf.csv" else read_record
     texts = ["", "\n", "\0", '"', "a\n", lines[0], lines[0] + "\n", "x" * 3_000_000, text[:-20], text.replace("\n", "\r\n"),
              "\ufeff" + text, text + "1,2\n", text * 2, ("," * 50_000 + "\n") * 2]  # fmt: skip
     for _ in range(25):
@@ -240,7 +240,7 @@ def test_what_is_no_file_is_not_read(kind, name, argon, tmp_path):
         return
     if name != "final.npz":
         with pytest.raises(OutputError, match=name):
-            (read_findings if name in (ANALYSIS, "rdf.csv") else read_record)(folder)
+            (read_results if name in (ANALYSIS, "rdf.csv") else read_record)(folder)
     if name in ("summary.json", "log.csv") or (name == "final.npz" and kind != "huge"):
         assert any(name in text for text in compare(folder, argon).missing)
 

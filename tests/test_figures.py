@@ -37,7 +37,7 @@ from support import (
     small_scene,
 )
 from support import SAMPLE_NUMBERS as NUMBERS
-from support import analysis_drawn as drawn
+from support import draw_analysis_curve as drawn
 
 from rigidmd.scene import Scene
 

@@ -393,7 +393,7 @@ def test_a_box_that_nothing_holds_together():
 
 def test_a_box_that_becomes_too_small_for_the_cut_off():
     scene = small_scene({"argon": 8}, 12.5, forces={"cutoff_A": 6.0}, stages=[stage_of(pressure_bar=5000.0)])
-    with pytest.raises(SimulationError, match="too small for the cut-off"):
+    with pytest.raises(SimulationError, match="too small for the cutoff"):
         minimum_of(scene)
 
 

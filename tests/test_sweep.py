@@ -19,16 +19,15 @@ from support import (
     ROOT,
     Axis,
     Curve,
-    Finding,
+    AnalysisResult,
     FolderLock,
     Pool,
-    Row,
+    SweepRow,
     Value,
     Waiting,
     code_kind,
-    in_hours,
-    in_ranges,
-    measured,
+    format_ranges,
+    format_walltime,
     over_replicas,
     parse_axis,
     point_name,
@@ -36,6 +35,7 @@ from support import (
     read_record,
     run_points,
     short_keys,
+    summarise_run,
     sweeping,
     value_name,
     worker,
@@ -148,7 +148,7 @@ def test_one_value_is_the_same_for_all_points(text, value):
     [
         ("seed", "is not KEY=VALUE"), ("=1,2", "is not KEY=VALUE"), ("a,=1,2", "is not KEY=VALUE"),
         ("seed=1,,2", "empty value"), ("seed=1,", "empty value"), ("seed=4..1", "the range 4..1 is empty"),
-        ("seed=0.1..0.5", "no range of whole numbers"), ("seed=1..10000000", "more than 100000 values"),
+        ("seed=0.1..0.5", "not a range of whole numbers"), ("seed=1..10000000", "more than 100000 values"),
         ("a=[1,2", "] is missing"), ("a=1]", "] closes nothing"), ('a="x,y', '" is missing'),
     ],
 )  # fmt: skip
@@ -183,12 +183,12 @@ def test_all_combinations_with_keys_that_go_together():
 
 def test_cores_are_full(monkeypatch):
     monkeypatch.setattr(sweeping, "cores", lambda: 8)
-    assert sweeping.shares(24, None, None, False) == (8, 1)
-    assert sweeping.shares(3, None, None, False) == (3, 2)
-    assert sweeping.shares(24, 2, None, False) == (2, 4)
-    assert sweeping.shares(24, None, 4, False) == (2, 4)
-    assert sweeping.shares(24, 16, None, False) == (16, 1)
-    assert sweeping.shares(3, None, None, True) == (3, 1)
+    assert sweeping.jobs_and_threads(24, None, None, False) == (8, 1)
+    assert sweeping.jobs_and_threads(3, None, None, False) == (3, 2)
+    assert sweeping.jobs_and_threads(24, 2, None, False) == (2, 4)
+    assert sweeping.jobs_and_threads(24, None, 4, False) == (2, 4)
+    assert sweeping.jobs_and_threads(24, 16, None, False) == (16, 1)
+    assert sweeping.jobs_and_threads(3, None, None, True) == (3, 1)
 
 
 # Runs
@@ -228,7 +228,7 @@ def test_the_energy_of_a_molecule_has_its_share_of_the_error(finished):
     columns = {name: np.resize(values, 40) for name, values in record.columns.items()}
     columns["time"] = np.linspace(0.0, 0.5, 40)
     columns["potential"] = np.random.default_rng(1).standard_normal(40) - 5.0
-    found = measured(replace(record, columns=columns))
+    found = summarise_run(replace(record, columns=columns))
     energy, error = found["Potential Energy (kJ/mole)"]
     assert error > 0.1
     assert found["Potential Energy per molecule (kJ/mole)"] == pytest.approx((energy / 20, error / 20))
@@ -277,8 +277,8 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     (copied / "notes.txt").write_text("mine")
     (copied / "temperature_K=90_seed=1" / "mine.txt").write_text("mine")
     with ExitStack() as stack:
-        wanted = sweeping.Wanted(argon, [Axis(("seed",), (1, 2))], copied, force=True)
-        assert sweeping.opened(wanted, stack).left == 2
+        wanted = sweeping.SweepRequest(argon, [Axis(("seed",), (1, 2))], copied, force=True)
+        assert sweeping.open_sweep(wanted, stack).left == 2
     assert [path.name for path in copied.iterdir() if path.is_dir()] == ["temperature_K=90_seed=1"]
     assert [path.name for path in (copied / "temperature_K=90_seed=1").iterdir()] == ["mine.txt"]
     assert {path.name for path in copied.iterdir() if path.is_file() and not path.name.startswith(".")} == {
@@ -290,7 +290,7 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
 def test_replicas_of_unlike_axes_and_short_runs():
     def found(x, value):
         curve = Curve("msd", ("t", x), "MSD", {"MSD": 2 * x}, {"MSD": x})
-        return [Finding("msd", "about", [Value("D", "", value, 9.0)], [curve], ["note"])]
+        return [AnalysisResult("msd", "about", [Value("D", "", value, 9.0)], [curve], ["note"])]
 
     (mean,) = over_replicas(
         [found(np.linspace(0, 4, 5), 1.0), found(np.linspace(0, 3, 7), 3.0), found(np.linspace(0, 9, 4), None)]
@@ -307,9 +307,9 @@ def test_replicas_of_unlike_axes_and_short_runs():
 
 
 def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
-    assert Row({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (2.0, pytest.approx(1.0))
-    assert Row({}, {1: {"x": (1.0, 0.5)}, 2: {}})["x"] == (1.0, 0.5)
-    assert Row({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, 0.0)
+    assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (2.0, pytest.approx(1.0))
+    assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {}})["x"] == (1.0, 0.5)
+    assert SweepRow({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, 0.0)
 
 
 def test_bodies_and_words(tmp_path, capsys):
@@ -377,7 +377,7 @@ def long_sweep(argon, folder, **more):
         "seed": range(1, 4),
     } | more
     with ExitStack() as stack:
-        return sweeping.opened(sweeping.Wanted(argon, sweeping.axes_of(changes), folder), stack).manifest
+        return sweeping.open_sweep(sweeping.SweepRequest(argon, sweeping.axes_of(changes), folder), stack).manifest
 
 
 @pytest.fixture(scope="module")
@@ -398,13 +398,13 @@ def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, who
     def disturb(name, kind, value):
         if kind == "died":
             died.append(name)
-        elif kind == "share" and not killed:
+        elif kind == "fraction" and not killed:
             killed.append(name)
             next(worker for worker in pool._busy if worker.task["name"] == name).kill()
-        elif kind == "share" and died:
+        elif kind == "fraction" and died:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    outcome = run_points(folder, manifest, pool, hear=disturb)
+    outcome = run_points(folder, manifest, pool, receive=disturb)
     assert outcome.failed == killed
     assert outcome.signal == signal.SIGTERM
     assert outcome.left
@@ -453,9 +453,9 @@ def test_a_point_waits_for_a_run_that_is_about_to_stop(tmp_path):
     lock = FolderLock(tmp_path)
     lock.take()
     with pytest.raises(OutputError, match="did not end within"):
-        worker.wait_for_others(tmp_path, 0.1)
+        worker.wait_for_folder(tmp_path, 0.1)
     lock.release()
-    worker.wait_for_others(tmp_path, 0.1)
+    worker.wait_for_folder(tmp_path, 0.1)
 
 
 def test_a_scene_that_changes_meanwhile_is_not_run(argon, tmp_path):
@@ -538,11 +538,11 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
     folder = tmp_path / "sweep"
 
     def stop(name, kind, value):
-        if kind == "share":
+        if kind == "fraction":
             os.kill(os.getpid(), signal.SIGTERM)
 
     manifest = long_sweep(argon, folder)
-    outcome = run_points(folder, manifest, Cluster("local", 2, 1, folder, Path.cwd()), hear=stop)
+    outcome = run_points(folder, manifest, Cluster("local", 2, 1, folder, Path.cwd()), receive=stop)
     assert outcome.left
     assert not outcome.failed
     assert not run_points(folder, long_sweep(argon, folder), Pool(2, 1)).left
@@ -552,7 +552,7 @@ def test_a_signal_stops_a_cluster(argon, whole, tmp_path):
 def test_without_a_cluster(argon, tmp_path, monkeypatch, capsys):
     from support import cluster
 
-    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     arguments = ["sweep", str(argon), *GRID, "-o", str(tmp_path / "sweep"), "--scheduler"]
     if "distributed" in sys.modules:
         assert cli.main([*arguments, "tcp://127.0.0.1:9"]) == 2
@@ -615,9 +615,9 @@ def test_slurm_jobs_submit_themselves_again(argon, slurm):
 
 
 def test_words_for_slurm():
-    assert in_ranges([0, 1, 2, 5, 7, 8]) == "0-2,5,7-8"
-    assert in_hours(3661.9) == "1:01:01"
-    assert in_hours(100 * 3600) == "100:00:00"
+    assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2,5,7-8"
+    assert format_walltime(3661.9) == "1:01:01"
+    assert format_walltime(100 * 3600) == "100:00:00"
 
 
 # Bad input
@@ -630,8 +630,8 @@ def test_words_for_slurm():
         (["--set", "seed=3"], "no key has several values"),
         (["--set", "seed=1..3", "--set", "seed=5,6"], "seed is set 2 times"),
         (["--set", "seed=4..1", "--set", "a=1,,2"], "2 errors"),
-        (["--set", "seed=1,1"], "seed: 1 is there 2 times"),
-        (["--set", "start.temperature_K=90,90.0"], "90 is there 2 times"),
+        (["--set", "seed=1,1"], "seed: 1 is listed 2 times"),
+        (["--set", "start.temperature_K=90,90.0"], "90 is listed 2 times"),
         (["--set", "sed=1..3"], "did you mean seed?"),
         (["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"], "these are 1000000 points"),
         (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
@@ -698,10 +698,10 @@ def test_a_manifest_names_no_folder_outside(copied, argon, capsys):
         told["points"][0]["folder"] = name
         (copied / "sweep.json").write_text(json.dumps(told))
         assert cli.main(["sweep", str(argon), *GRID, "-o", str(copied)]) == 2
-        assert "names of folders that a sweep does not give" in capsys.readouterr().err
+        assert "points with invalid names of folders" in capsys.readouterr().err
 
 
-def test_a_manifest_of_a_stranger_is_held_against_what_it_should_be(copied, argon, capsys):
+def test_an_invalid_manifest_is_refused(copied, argon, capsys):
     whole = json.loads((copied / "sweep.json").read_text())
     for change in (
         {"keys": []}, {"keys": {"seed": ["other"], "start.temperature_K": ["start.temperature_K"]}}, {"fixed": "x"},

@@ -1,11 +1,19 @@
-"""What commands share: their exit codes, and pieces of their command lines."""
+"""Parts that commands share: exit codes, arguments, and the reading of their scene."""
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Callable
 from math import inf, nan
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+#: What the function `add` of each command is given.
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 #: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
 BY_SIGNAL = 128
@@ -14,8 +22,23 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
 OUT_OF_TIME = 75
 
 
-def number(kind: type, least: float, most: float, what: str) -> Callable[[str], Any]:
-    """A reader of numbers in a range, whole or real ones, for argparse; what : what they are, in words."""
+def add_command(
+    commands: Commands, name: str, function: Callable[[argparse.Namespace], int], about: str, example: str
+) -> argparse.ArgumentParser:
+    """Add a command, which calls function(options) and returns its exit code."""
+    parser = commands.add_parser(
+        name,
+        help=about,
+        description=about[0].upper() + about[1:] + ".",
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(command=function, writes=False)  # writes: its results are files, not what it prints
+    return parser
+
+
+def number(kind: type, least: float, most: float, description: str) -> Callable[[str], Any]:
+    """A reader for argparse of int or float numbers in a range."""
 
     def read(text: str) -> Any:
         try:
@@ -23,7 +46,7 @@ def number(kind: type, least: float, most: float, what: str) -> Callable[[str], 
         except ValueError:
             value = nan
         if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not {description}")
         return value
 
     return read
@@ -47,36 +70,100 @@ def seconds(text: str) -> float:
     return found_seconds
 
 
+def add_output_folder(parser: argparse.ArgumentParser, default: str, earlier: str = "earlier results") -> None:
+    """Add -o and --force of a command that writes a folder."""
+    parser.add_argument("-o", "--output", metavar="DIR", help=f"folder (default: {default})")
+    parser.add_argument("--force", action="store_true", help=f"replace {earlier} in that folder")
+    parser.set_defaults(writes=True)
+
+
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add --trust, for the Python files of forces of a scene."""
     parser.add_argument(
-        "--trust",
-        action="append",
-        default=[],
-        metavar="FILE.py",
+        "--trust", action="append", default=[], metavar="FILE.py",
         help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
         "you can; may be repeated",
-    )
+    )  # fmt: skip
 
 
 def add_engine(
     parser: argparse.ArgumentParser, known: str = "rigidmd, lammps or openmm", default: str = "the scene's"
 ) -> None:
-    """Add the options that set the table [engine] of a scene. known : its names, in words; default : in words"""
+    """Add the options that set the table [engine] of a scene."""
+    parser.add_argument("--engine", metavar="NAME", help=f"engine to use, {known}: engine.name (default: {default})")
+    parser.add_argument("--ranks", type=int, metavar="N", help="number of MPI processes of lammps (default: 1)")
+    parser.add_argument("--platform", metavar="NAME", help="platform of openmm: CPU, Reference, CUDA, OpenCL or HIP")
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """Add SCENE, --set and --trust, which `read_scene` reads."""
+    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
     parser.add_argument(
-        "--engine", metavar="NAME", help=f"who computes, {known}: the key engine.name of the scene (default: {default})"
-    )
-    parser.add_argument("--ranks", type=int, metavar="N", help="of lammps: MPI processes (default: 1)")
-    parser.add_argument("--platform", metavar="NAME", help="of openmm: CPU, Reference, CUDA, OpenCL or HIP")
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
+        help="override a key of the scene by its dotted path (an entry of a list by its number, counted from 0, or a "
+        "stage by its name); KEY= without a value removes the key; may be repeated",
+    )  # fmt: skip
+    add_trust(parser)
 
 
-def say(sentence: str) -> None:
-    """Announce something that takes a moment."""
-    print(f"  {sentence} ...", file=sys.stderr, flush=True)
+def read_scene(options: argparse.Namespace, **more):
+    """The scene of the options of `add_scene` and `add_engine`; more : further keys to override."""
+    from rigidmd.scene import Scene, parse_override
+
+    if options.trust:
+        from rigidmd.assemble.user_code.trust import check_trusted, trust
+
+        for path in options.trust:
+            trust(path)
+    overrides = dict(parse_override(text) for text in options.overrides)
+    for option, key in (("engine", "name"), ("ranks", "ranks"), ("platform", "platform")):
+        if (value := getattr(options, option, None)) is not None:
+            overrides[f"engine.{key}"] = value
+    scene = Scene.read(options.scene, overrides | more)
+    if options.trust:
+        check_trusted(scene, options.trust)
+    return scene
 
 
-def warn(sentence: str) -> None:
-    """Print a warning."""
-    from rigidmd.errors import visible
+def add_run_folder(parser: argparse.ArgumentParser, output: str) -> None:
+    """Add RUN, -o and --force of a command that writes a file about a run."""
+    parser.add_argument("folder", metavar="RUN", help="folder of a run")
+    parser.add_argument("-o", "--output", metavar="FILE", help=output)
+    parser.add_argument("--force", action="store_true", help="replace that file")
+    parser.set_defaults(scene="this run", writes=True)
 
-    print(f"rigidmd: warning: {visible(sentence)}", file=sys.stderr)
+
+def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[str, ...]) -> Path:
+    """The file to write. By default it is in the folder of the run, where it may be replaced; a new run removes it.
+
+    Raises OutputError.
+    """
+    from rigidmd.io.folder import add_to_folder, check_is_run
+    from rigidmd.io.write import check_target
+
+    folder = Path(options.folder)
+    check_is_run(folder)
+    if options.output:
+        check_target(Path(options.output), extensions, options.force)
+        return Path(options.output)
+    add_to_folder(folder, [default])
+    return folder / default
+
+
+def command_line() -> str:
+    """The command line of this process."""
+    return shlex.join(["rigidmd", *sys.argv[1:]])
+
+
+def progress_bar(form: str = "{l_bar}{bar}| [{elapsed}<{remaining}]", total: float = 1.0) -> "tqdm":
+    """A bar on a terminal, which disappears at its end."""
+    from tqdm import tqdm
+
+    return tqdm(total=total, disable=None, leave=False, bar_format=form)
+
+
+def print_page(path: Path, notes: list[str]) -> None:
+    """Print where a page is, after notes about it."""
+    for note in notes:
+        print(note)
+    print(f"{path}: {path.stat().st_size / 1e6:.2g} MB; open it in a browser: {shlex.quote(str(path.resolve()))}")

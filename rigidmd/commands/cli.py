@@ -1,4 +1,4 @@
-"""`rigidmd`: lists the commands, parses the command line, and turns errors into messages and exit codes.
+"""`rigidmd`: the list of commands, the parsing of the command line, the messages and exit codes of errors.
 
 Each command has a module: its arguments (`add`), its call, and what it prints. Commands compute nothing. Modules import
 what they need inside functions, so that `rigidmd --help` loads none of it.
@@ -9,19 +9,16 @@ import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
+from importlib import import_module
 
-from rigidmd.commands import (
-    accuracy, analyse, check, compare, energy, examples, export, film, gallery, help, models, new, report, resume, run,
-    schema, stability, sweep, verify, view,
-)  # fmt: skip
 from rigidmd.commands.arguments import BAD_INPUT, FAILED, INTERRUPTED
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
-#: In the order of `rigidmd --help`.
+#: The modules of the commands, in the order of `rigidmd --help`.
 COMMANDS = (
-    examples, new, run, resume, compare, energy, check, export, verify, accuracy, stability, analyse, sweep, report,
-    view, film, gallery, models, schema, help,
+    "examples", "new", "run", "resume", "compare", "energy", "check", "export", "verify", "accuracy", "stability",
+    "analyse", "sweep", "report", "view", "film", "gallery", "models", "schema", "help",
 )  # fmt: skip
 
 EXAMPLES = """examples:
@@ -43,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a signal.
     """
-    from rigidmd.core.memory import format_gigabytes, free_memory  # now: an import may need more than there is
+    from rigidmd.core.process import format_gigabytes, free_memory
 
     options = argparse.Namespace()
 
@@ -95,12 +92,12 @@ def _parse(words: list[str]) -> argparse.Namespace:
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
         suggestion = _did_you_mean(name, commands) or "; `rigidmd --help` lists them"
-        parser.error(f"there is no command {name!r}{suggestion}")
+        parser.error(f"unknown command {name!r}{suggestion}")
     options, unknown = parser.parse_known_args(words)
     if unknown and name is not None:
         known = re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help())
         suggestion = _did_you_mean(unknown[0].partition("=")[0], known)
-        commands[name].error(f"there is no argument {unknown[0]!r}{suggestion}")
+        commands[name].error(f"unknown argument {unknown[0]!r}{suggestion}")
     return options
 
 
@@ -120,8 +117,8 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for module in COMMANDS:
-        module.add(commands)
+    for name in COMMANDS:
+        import_module(f"rigidmd.commands.{name}").add(commands)
     return parser, commands.choices
 
 

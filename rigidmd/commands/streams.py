@@ -1,4 +1,4 @@
-"""Standard output and standard error, which may be closed, full, or without a reader."""
+"""Standard output and standard error: messages, and streams that are closed, full, or without a reader."""
 
 import contextlib
 import io
@@ -7,13 +7,22 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, visible
+
+
+def announce(message: str) -> None:
+    """Announce work that takes a moment."""
+    print(f"  {message} ...", file=sys.stderr, flush=True)
+
+
+def warn(message: str) -> None:
+    print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
 
 
 def open_streams() -> None:
     """Open what was closed before the start, so that no file of a run gets the number of a standard stream.
 
-    What the encoding of a terminal lacks is written as an escape, and ends no run.
+    What the encoding of a terminal lacks is written as an escape and does not end the run.
     """
     for number in (0, 1, 2):
         try:
@@ -47,21 +56,19 @@ class _Checked:
         self._stream, self._lasting = stream, lasting
 
     def write(self, text: str) -> int:
-        """Write; the number of letters."""
-        with self._told():
+        with self._errors_reported():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Write what is held."""
-        with self._told():
+        with self._errors_reported():
             self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _errors_reported(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -73,7 +80,7 @@ class _Checked:
             raise OutputError(f"standard output cannot be written: {error.strerror}") from None
 
     def _silence(self) -> None:
-        """Let it go nowhere from now on, with what it still holds."""
+        """Send further output to the null device, with what the stream still holds."""
         with contextlib.suppress(OSError, ValueError):  # a stream in memory has no number, and does not fail
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())

@@ -1,4 +1,4 @@
-"""A scene as a folder that another engine runs by itself."""
+"""`rigidmd export`: writes a scene as a folder that another engine runs by itself."""
 
 import os
 import tempfile
@@ -18,30 +18,30 @@ from rigidmd.run import MolecularSimulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.engine import EngineChoice
 
-#: Lists what an export wrote in its folder; --force replaces files of an export only.
+#: File that lists what an export wrote in its folder; --force replaces the files of an export only.
 MARKER = ".rigidmd-export"
 
 
-class Writer(NamedTuple):
-    """How scenes go to an engine."""
+class EngineWriter(NamedTuple):
+    """Writes scenes for an engine."""
 
-    title: str
-    unsupported_features: Callable[[ForceFieldView], list[str]]  # what it cannot do
-    write: Callable[[Path, ForceFieldView, State], list[str]]  # into a folder; the files
-    command: str  # that runs it there
+    title: str  # name of the engine
+    unsupported_features: Callable[[ForceFieldView], list[str]]
+    write: Callable[[Path, ForceFieldView, State], list[str]]  # into a folder; returns the names of files
+    command: str  # that runs the scene in the folder
 
 
 class Exported(NamedTuple):
     """What was written."""
 
-    title: str  # the engine
+    title: str  # name of the engine
     files: list[str]
     notes: list[str]
-    command: str  # that runs it, in the folder
+    command: str  # that runs the scene in the folder
 
 
 def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported:
-    """Write a scene for "lammps", "openmm" or "gromacs", from the state from which time passes in a run of rigidmd.
+    """Write a scene for "lammps", "openmm" or "gromacs". It starts after overlap removal and the first minimisations.
 
     Raises SceneError with all that the engine cannot do, OutputError if the folder is in use.
     """
@@ -49,21 +49,21 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
         raise SceneError(scene.source, ["a single body stays with rigidmd: export is for molecules"])
     _check(folder, force)
     writer = writer_for(to)
-    system = build(scene.model_copy(update={"engine": engine_named(to)}))
-    drawn = force_field_of(system)
-    unsupported_features = writer.unsupported_features(drawn) + [
+    system = build(scene.model_copy(update={"engine": _engine_choice(to)}))
+    view = force_field_of(system)
+    unsupported = writer.unsupported_features(view) + [
         f"stages.{k}: a minimisation after other stages stays with rigidmd"
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation and any(not before.is_minimisation for before in system.scene.stages[:k])
     ]
-    if unsupported_features:
-        raise SceneError(scene.source, [f"{writer.title}: {fault}" for fault in unsupported_features])
+    if unsupported:
+        raise SceneError(scene.source, [f"{writer.title}: {feature}" for feature in unsupported])
     state = start_of(system)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export", dir=folder) as made:
             write_scene(Path(made), system.scene)
-            names = [SCENE, *input_names(system.scene).values(), *writer.write(Path(made), drawn, state)]
+            names = [SCENE, *input_names(system.scene).values(), *writer.write(Path(made), view, state)]
             check_names(folder, names, MARKER)
             for name in written_by_runs(folder, MARKER):
                 (folder / name).unlink(missing_ok=True)
@@ -74,30 +74,30 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
 
 
 def start_of(system: System) -> State:
-    """The state from which time passes: overlaps relieved, first minimisations done, by rigidmd itself."""
+    """The state after overlap removal and the first minimisations, by rigidmd itself."""
     scene = system.scene.model_copy(update={"engine": EngineChoice()})
     return MolecularSimulation(scene, warn=lambda sentence: None).settle()
 
 
-def engine_named(to: str) -> EngineChoice:
-    """The engine for which a scene leaves things open; GROMACS has the thermostats and barostats of rigidmd."""
+def _engine_choice(to: str) -> EngineChoice:
+    """The engine whose defaults a scene gets; GROMACS has the thermostats and barostats of rigidmd."""
     return EngineChoice() if to == "gromacs" else EngineChoice.model_validate({"name": to})
 
 
-def writer_for(to: str) -> Writer:
-    """How scenes go to "lammps", "openmm" or "gromacs"."""
+def writer_for(to: str) -> EngineWriter:
+    """The writer for "lammps", "openmm" or "gromacs"."""
     if to == "lammps":
         from rigidmd.engines.lammps.files import INPUT, unsupported_features, write_lammps
 
-        return Writer("LAMMPS", unsupported_features, write_lammps, f"lmp -in {INPUT}")
+        return EngineWriter("LAMMPS", unsupported_features, write_lammps, f"lmp -in {INPUT}")
     if to == "gromacs":
         from rigidmd.engines.gromacs.files import unsupported_features, write_gromacs
 
-        return Writer("GROMACS", unsupported_features, write_gromacs, "sh run.sh")
+        return EngineWriter("GROMACS", unsupported_features, write_gromacs, "sh run.sh")
     from rigidmd.engines.openmm.files import write_openmm
     from rigidmd.engines.openmm.system import unsupported_features
 
-    return Writer("OpenMM", unsupported_features, write_openmm, "python run.py")
+    return EngineWriter("OpenMM", unsupported_features, write_openmm, "python run.py")
 
 
 def _check(folder: Path, force: bool) -> None:

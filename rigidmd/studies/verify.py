@@ -1,4 +1,4 @@
-"""A scene on two engines: the start term by term, then a short run of both at constant energy."""
+"""`rigidmd verify`: a scene on two engines, its start term by term, then a short run of both at constant energy."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -20,17 +20,17 @@ from rigidmd.scene.stage import Stage
 from rigidmd.studies.export import start_of
 from rigidmd.units import FEMTOSECOND
 
-#: Steps of the short run, and of what, fs.
+#: Number of steps of the short run, and their length, fs.
 STEPS, STEP = 50, 1.0
-#: Å by which positions may differ after it, where forces are sums of pairs; of moves beyond 1 Å a fraction.
-APART = 1e-6
-#: Times the relative error of lengths that sites may part by, relative to their move: measured 10 (216 SPC/E).
+#: Tolerance of positions after it (Å), where forces are sums of pairs; for moves beyond 1 Å relative to the move.
+TOLERANCE = 1e-6
+#: Tolerance of positions relative to the move, in relative errors of lengths: 10 were measured (216 SPC/E).
 GROWTH = 20
-#: Runs with steps halved again and again, where engines have different methods, both of order 2.
+#: Number of runs, each with half the step of the one before, where engines have different methods of order 2.
 HALVINGS = 4
 
 
-class Verified(NamedTuple):
+class Verification(NamedTuple):
     """Two engines at the start of a scene and after a short run from there."""
 
     scene: str
@@ -40,26 +40,24 @@ class Verified(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether they do, everywhere."""
         return all(line.agrees for line in (*self.start, *self.run))
 
-    def in_words(self) -> str:
+    def description(self) -> str:
         name = self.other.split()[0]
         parts = [f"{self.scene}: rigidmd and {self.other} at the start"]
         parts += [describe_comparison(self.start, name), f"after {STEPS} steps of {STEP:g} fs at constant energy"]
         parts += [describe_comparison(self.run, name), "they agree" if self.agrees else "they do NOT agree"]
         return "\n".join(parts)
 
-    def told(self) -> dict[str, Any]:
-        """As JSON has it."""
+    def to_json(self) -> dict[str, Any]:
         lines = {part: [line._asdict() for line in getattr(self, part)] for part in ("start", "run")}
         return {"scene": self.scene, "engine": self.other, "agrees": self.agrees, **lines}
 
 
-def verify(scene: Scene) -> Verified:
-    """Hold rigidmd against the engine that the scene names, both in double precision where that has it.
+def verify(scene: Scene) -> Verification:
+    """Compare rigidmd with the engine that the scene names, both in double precision where that engine has it.
 
-    Raises SceneError with all that the other engine cannot do, EngineError if it is not here.
+    Raises SceneError with all that the other engine cannot do, EngineError if it is not installed.
     """
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
@@ -73,40 +71,41 @@ def verify(scene: Scene) -> Verified:
     try:
         start = compare_at(system, state, system.engine_of(system.terms, "double"), other)
         run = _short_run(system, state, other)
-        return Verified(scene.name, other.version, start, run)
+        return Verification(scene.name, other.version, start, run)
     finally:
         other.close()
 
 
 def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comparison]:
-    """Both engines from the state on: how far sites have moved, and how far apart they are then."""
+    """Compare the largest moves of sites on both engines from a state on, and the difference of their positions."""
     rotor, span = other.rotor(system.model), STEPS * STEP * FEMTOSECOND
     here = replace(system, model=system.model._replace(rotor=rotor)) if rotor is not None else system
-    own = here.engine_of(here.terms, "double")
-    if rotor is not None:  # both turn bodies by the same composition of rotations: every step is the same
-        ends, doubt = [_sites_after(system, engine, state, STEPS) for engine in (own, other)], 0.0
+    engines = here.engine_of(here.terms, "double"), other
+    if rotor is not None:  # both rotate bodies by the same composition of rotations: every step is the same
+        ends, step_error = [_sites_after(system, engine, state, STEPS) for engine in engines], 0.0
     else:
-        found = [_extrapolated(system, engine, state) for engine in (own, other)]
-        ends, doubt = [end for end, _ in found], sum(error for _, error in found)
-    apart = float(np.abs(ends[0] - ends[1]).max())
-    far = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
-    allowed = APART * max(1.0, far[0]) + doubt + GROWTH * other.length_tolerance * far[0] + _of_accuracy(system, span)
-    return [Comparison("largest move of a site", "Å", far[0], far[1], apart, allowed)]
+        found = [_extrapolated(system, engine, state) for engine in engines]
+        ends, step_error = [end for end, _ in found], sum(error for _, error in found)
+    difference = float(np.abs(ends[0] - ends[1]).max())
+    moves = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
+    tolerance = TOLERANCE * max(1.0, moves[0]) + step_error + GROWTH * other.length_tolerance * moves[0]
+    tolerance += _ewald_tolerance(system, span)
+    return [Comparison("largest move of a site", "Å", moves[0], moves[1], difference, tolerance)]
 
 
 def _sites_after(system: System, engine: Engine, state: State, steps: int) -> np.ndarray:
-    """Positions of sites (s, 3) after the span of the short run in so many steps."""
+    """Positions of sites (s, 3) after the span of the short run, in this number of steps."""
     scheme, dt = SCHEMES["velocity_verlet"], STEPS * STEP * FEMTOSECOND / steps
     moved = engine.begin(state, scheme)
-    moved.begin_stretch(0.0)
+    moved.begin_segment(0.0)
     engine.forget()
     engine.advance(moved, scheme, dt, int(moved.step[NOW]) + steps)
     return system.site_positions(moved)
 
 
 def _extrapolated(system: System, engine: Engine, state: State) -> tuple[np.ndarray, float]:
-    """The same extrapolated to a step of 0, which methods of order 2 share, and the largest change by the last step of
-    the extrapolation (Romberg's scheme: errors are even powers of the step)."""
+    """Positions extrapolated to a step of 0, where methods of order 2 agree, and the largest change by the last
+    extrapolation (Romberg's scheme: errors are even powers of the step)."""
     table = [_sites_after(system, engine, state, STEPS * 2**k) for k in range(HALVINGS)]
     change = 0.0
     for order in range(1, HALVINGS):
@@ -115,8 +114,8 @@ def _extrapolated(system: System, engine: Engine, state: State) -> tuple[np.ndar
     return table[0], change
 
 
-def _of_accuracy(system: System, span: float) -> float:
-    """How far the errors of an Ewald sum on both engines may carry a site in a span (ps), Å."""
+def _ewald_tolerance(system: System, span: float) -> float:
+    """The difference of positions (Å) after a span (ps) that errors of the Ewald sums of both engines explain."""
     error, worst = system.force_error or 0.0, 0.0
     for m in system.species:
         least = m.inertia[m.inertia > 0].min(initial=np.inf)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.analysis.files import drawn, read_findings
+from rigidmd.analysis.files import draw_curve, read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.statistics import format_signed, format_with_error, mean
@@ -122,7 +122,7 @@ def _drifts(record: Record) -> str:
 def _analyses(record: Record) -> Iterator[str]:
     """What `rigidmd analyse` found: values, what was left out, figures."""
     rows, left_out, figures, stretches = [], [], [], []
-    for finding, stretch in read_findings(record.folder):
+    for finding, stretch in read_results(record.folder):
         for value in finding.values:
             told = "" if value.value is None else format_with_error(value.value, value.error)
             time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
@@ -132,7 +132,7 @@ def _analyses(record: Record) -> Iterator[str]:
         else:
             stretches.append(stretch)
         for curve in finding.curves:
-            svg = figure(drawn(curve), f"analysis-{curve.file}", curve.label)
+            svg = figure(draw_curve(curve), f"analysis-{curve.file}", curve.label)
             figures.append(f"<figure>{svg}</figure>")
     if not rows and not figures and not left_out:
         return

@@ -1,4 +1,4 @@
-"""Molecules that collide too fast, are too close, or lack repulsion."""
+"""Stability cases: molecules that collide too fast, are too close, or lack repulsion."""
 
 import tempfile
 from math import sqrt
@@ -11,18 +11,18 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import write_state
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
-from rigidmd.studies.stability.outcomes import REFUSED, RIGHT, TOLD, Finding, Outcome, longest_step
-from rigidmd.studies.stability.runs import (
+from rigidmd.studies.stability.cases import (
     SPLIT,
-    attempt,
-    case,
     energy_error,
     families,
-    molecular,
+    molecular_scene,
     molecules_scene,
+    outcome_of,
+    register_case,
     run_molecules,
     simulate,
 )
+from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
 from rigidmd.units import BOLTZMANN
 
 #: A bent molecule of three sites with Lennard-Jones and charges, of the same kind of scene as water.
@@ -30,34 +30,32 @@ SIGMA, EPSILON = 3.2, 80.0
 
 
 def bent(off_line: float = 0.5, name: str = "bent", mass: float = 12.0) -> dict:
-    """Three equal sites 1 Å apart, the middle one at this height (Å) off the line of the others."""
+    """Three equal sites with steps of 1 Å along x, the middle one at this height (Å) off the line of the others."""
     site = {"mass_u": mass, "sigma_A": SIGMA, "epsilon_K": EPSILON}
-    return {
-        "name": name,
-        "sites": [
-            site | {"name": "A", "position_A": [-1.0, 0.0, 0.0], "charge_e": 0.2},
-            site | {"name": "B", "position_A": [0.0, float(off_line), 0.0], "charge_e": -0.4},
-            site | {"name": "C", "position_A": [1.0, 0.0, 0.0], "charge_e": 0.2},
-        ],
-    }
+    sites = [
+        site | {"name": "A", "position_A": [-1.0, 0.0, 0.0], "charge_e": 0.2},
+        site | {"name": "B", "position_A": [0.0, float(off_line), 0.0], "charge_e": -0.4},
+        site | {"name": "C", "position_A": [1.0, 0.0, 0.0], "charge_e": 0.2},
+    ]
+    return {"name": name, "sites": sites}
 
 
 BOX, FORCES = {"lengths_A": 20.0}, {"cutoff_A": 9.0, "truncation": "smooth_switch"}
 
 
-def pair_of(apart: float, speed: float, thickness: float = 0.5) -> tuple[list[dict], State]:
-    """Two bent molecules side by side (Å) that approach each other at a speed (Å/ps), turned at random."""
+def pair_of(distance: float, speed: float, thickness: float = 0.5) -> tuple[list[dict], State]:
+    """Two bent molecules at a distance (Å) that approach each other at a speed (Å/ps)."""
     species = [bent(thickness) | {"count": 2}]
     data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
-    state = build(molecular(data)).state
-    state.position[:] = [[10 - apart / 2, 10, 10], [10 + apart / 2, 10.1, 10]]
+    state = build(molecular_scene(data)).state
+    state.position[:] = [[10 - distance / 2, 10, 10], [10 + distance / 2, 10.1, 10]]
     state.velocity[:] = [[speed / 2, 0, 0], [-speed / 2, 0, 0]]
     state.angular_momentum_body[:] = 0.0
     return species, state
 
 
-@case(7, x="temperature (K)", error="energy error over kinetic energy", step="fs")
-def head_on(find: Finding, quick: bool) -> None:
+@register_case(7, x="temperature (K)", error="energy error over kinetic energy", step="fs")
+def head_on(result: CaseResult, quick: bool) -> None:
     """Head-on collisions of Lennard-Jones molecules at 1e2 to 1e6 K, with the step scaled to the speed."""
     for temperature in (1e2, 1e6) if quick else (1e2, 1e3, 1e4, 1e5, 1e6):
         speed = 2 * sqrt(3 * BOLTZMANN * temperature / 36.0)
@@ -71,14 +69,14 @@ def head_on(find: Finding, quick: bool) -> None:
         step = 0.4 / speed * 10  # a hundredth of an ångström
         for family in families(quick):
             allowed = 5e-2 if family.startswith(SPLIT) else 1e-2
-            find.add(f"{temperature:.0e} K", at(step, family), allowed, family, temperature, step)
+            result.add(f"{temperature:.0e} K", at(step, family), allowed, family, temperature, step)
             if temperature == 1e2 or not quick:
-                find.limits.append(longest_step(lambda h, f=family: at(h, f), step, f"{temperature:.0e} K", family))
+                result.limits.append(longest_step(lambda h, f=family: at(h, f), step, f"{temperature:.0e} K", family))
 
 
-@case(7, x="distance over sigma", error="energy error over the energy of the start", step="fs")
-def overlaps(find: Finding, quick: bool) -> None:
-    """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused, relieved or computed correctly."""
+@register_case(7, x="distance over sigma", error="energy error over the energy of the start", step="fs")
+def overlaps(result: CaseResult, quick: bool) -> None:
+    """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused, separated or computed correctly."""
     for ratio in (0.5, 0.1, 0.0):
         data = molecules_scene([bent() | {"count": 2}], BOX, 0.01, 400, SPLIT, 10.0, None, FORCES)
         species, state = pair_of(ratio * SIGMA, 0.0)
@@ -87,14 +85,13 @@ def overlaps(find: Finding, quick: bool) -> None:
         def released(data=data, state=state) -> Outcome:
             return from_file(data, state)
 
-        find.add(f"file with {ratio:g} sigma", released(), 0.0, SPLIT, ratio, 0.01, (REFUSED,))
+        result.add(f"file with {ratio:g} sigma", released(), 0.0, SPLIT, ratio, 0.01, (REFUSED,))
     for density in (5.0, 50.0):
         edge = (4 * 36.0 / (density * 0.602214)) ** (1 / 3)
         cutoff = {"cutoff_A": 0.45 * edge}
-        data = molecules_scene(
-            [bent() | {"count": 4}], {"density_g_cm3": density}, 0.5, 100, SPLIT, 300.0, None, cutoff
-        )
-        find.add(f"lattice of {density:g} g/cm³", run_molecules(data), 0.01, SPLIT, 0.0, 0.5, (REFUSED,))
+        species, box = [bent() | {"count": 4}], {"density_g_cm3": density}
+        data = molecules_scene(species, box, 0.5, 100, SPLIT, 300.0, None, cutoff)
+        result.add(f"lattice of {density:g} g/cm³", run_molecules(data), 0.01, SPLIT, 0.0, 0.5, (REFUSED,))
     species, state = pair_of(0.5 * SIGMA, 0.0)
     data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
     for family in families(quick):
@@ -105,83 +102,74 @@ def overlaps(find: Finding, quick: bool) -> None:
 
             def run() -> Outcome:
                 results = simulate(unwatched, state)
-                told = energy_error(results, results["potential"][0])
-                return Outcome(told, told)
+                reported_error = energy_error(results, results["potential"][0])
+                return Outcome(reported_error, reported_error)
 
-            return attempt(run)
+            return outcome_of(run)
 
-        find.add("let go at 0.5 sigma", at(0.005), 1e-2, family, 0.5, 0.005)
-        find.limits.append(longest_step(at, 0.005, "let go at 0.5 sigma", family))
+        result.add("let go at 0.5 sigma", at(0.005), 1e-2, family, 0.5, 0.005)
+        result.limits.append(longest_step(at, 0.005, "let go at 0.5 sigma", family))
 
 
 def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
-    """A scene that starts from a file with the molecules of a state."""
+    """The outcome of a scene that starts from a file with the molecules of a state."""
 
     def run() -> Outcome:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "start.npz"
             template = data | {"start": {"temperature_K": 0.0}}
-            system = build(molecular(template))
+            system = build(molecular_scene(template))
             write_state(path, system.saved(state))
             started = data | {"structure": {"file": path.name, "velocities": velocities}}
             results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
-        told = energy_error(results)
-        return Outcome(told, told)
+        reported_error = energy_error(results)
+        return Outcome(reported_error, reported_error)
 
-    return attempt(run)
+    return outcome_of(run)
 
 
-@case(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
-def bare_charges(find: Finding, quick: bool) -> None:
-    """A charge without repulsion beside an opposite one: they collapse, and the run reports it."""
+@register_case(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
+def bare_charges(result: CaseResult, quick: bool) -> None:
+    """A charge without repulsion next to an opposite one: they collapse, and the run reports it."""
     ion = {"mass_u": 10.0, "sigma_A": SIGMA, "epsilon_K": EPSILON}
-    bare = {
-        "name": "bare",
-        "count": 8,
-        "sites": [
-            ion | {"name": "O", "position_A": [0.0, 0.0, 0.0]},
-            {"name": "H", "mass_u": 2.0, "position_A": [3.0, 0.0, 0.0], "charge_e": 0.8},
-            {"name": "M", "mass_u": 2.0, "position_A": [-1.0, 2.5, 0.0], "charge_e": -0.8},
-        ],
-    }
+    sites = [
+        ion | {"name": "O", "position_A": [0.0, 0.0, 0.0]},
+        {"name": "H", "mass_u": 2.0, "position_A": [3.0, 0.0, 0.0], "charge_e": 0.8},
+        {"name": "M", "mass_u": 2.0, "position_A": [-1.0, 2.5, 0.0], "charge_e": -0.8},
+    ]
+    bare = {"name": "bare", "count": 8, "sites": sites}
     for family in families(quick):
-        data = molecules_scene([bare], BOX, 1.0, 500, family, 300.0, None, FORCES, looks=100)
-        find.add("arms longer than sigma/2", run_molecules(data), 0.1, family, 0.0, 1.0, (REFUSED, TOLD))
+        data = molecules_scene([bare], BOX, 1.0, 500, family, 300.0, None, FORCES, samples=100)
+        result.add("arms longer than sigma/2", run_molecules(data), 0.1, family, 0.0, 1.0, (REFUSED, REPORTED))
     data = molecules_scene([bare | {"count": 2}], BOX, 1.0, 100, SPLIT, 300.0, None, FORCES)
-    state = build(molecular(data)).state
+    state = build(molecular_scene(data)).state
     state.rotation[:] = np.eye(3)
-    sites = build(molecular(data)).sites.offset_body
-    state.position[:] = [[10, 10, 10], 10 + sites[1] - sites[5]]
-    find.add("a hydrogen on a charge site", from_file(data, state), 0.0, SPLIT, 0.0, 1.0, (REFUSED,))
+    offsets = build(molecular_scene(data)).sites.offset_body
+    state.position[:] = [[10, 10, 10], 10 + offsets[1] - offsets[5]]
+    result.add("a hydrogen on a charge site", from_file(data, state), 0.0, SPLIT, 0.0, 1.0, (REFUSED,))
 
 
-@case(1, x="height of the middle site (Å)", error="energy error over kinetic energy", step="fs")
-def near_linear_molecules(find: Finding, quick: bool) -> None:
+@register_case(1, x="height of the middle site (Å)", error="energy error over kinetic energy", step="fs")
+def near_linear_molecules(result: CaseResult, quick: bool) -> None:
     """Molecules bent by 0.5 Å to 1e-15 Å and exactly straight, at 300 K: right, or refused as hardly bent."""
     heights = [0.5, 1e-2, 1e-5, 0.0] if quick else [0.5] + [10.0**-k for k in range(1, 16)] + [0.0]
     for height in heights:
         for family in families(quick):
             step, steps = 1.0, 200
-            # the smaller the moment about the axis, the faster the spin that turns the middle site
+            # the smaller the moment about the axis, the faster the spin that rotates the middle site
             data = molecules_scene([bent(height) | {"count": 27}], BOX, step, steps, family, 300.0, None, FORCES)
-            find.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), step, (RIGHT, REFUSED))
+            result.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), step, (RIGHT, REFUSED))
 
 
-@case(2, x="mass ratio", error="energy error over kinetic energy", step="fs")
-def mass_ratio(find: Finding, quick: bool) -> None:
+@register_case(2, x="mass ratio", error="energy error over kinetic energy", step="fs")
+def mass_ratio(result: CaseResult, quick: bool) -> None:
     """Two species whose masses differ by 1e6, at the step of the light one."""
-    light, heavy = bent(0.5, "light", 1.0), bent(0.5, "heavy", 1e6)
+    species = [bent(0.5, "light", 1.0) | {"count": 20}, bent(0.5, "heavy", 1e6) | {"count": 7}]
     for family in families(quick):
-        data = molecules_scene(
-            [light | {"count": 20}, heavy | {"count": 7}], BOX, 0.5, 400, family, 300.0, None, FORCES
-        )
-        find.add("1e6", run_molecules(data), 0.02, family, 1e6, 0.5)
 
         def at(step: float, family=family) -> Outcome:
-            scene = molecules_scene(
-                [light | {"count": 20}, heavy | {"count": 7}], BOX, step, 400, family, 300.0, None, FORCES
-            )
-            return run_molecules(scene)
+            return run_molecules(molecules_scene(species, BOX, step, 400, family, 300.0, None, FORCES))
 
+        result.add("1e6", at(0.5), 0.02, family, 1e6, 0.5)
         if not quick:
-            find.limits.append(longest_step(at, 0.5, "1e6", family))
+            result.limits.append(longest_step(at, 0.5, "1e6", family))

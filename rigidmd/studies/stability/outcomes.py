@@ -1,20 +1,20 @@
-"""Stability: outcomes of runs that try to break the engine, verdicts on them, and the longest bounded step."""
+"""Outcomes of the runs of stability cases, verdicts on them, and the longest bounded step."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf, isnan, nan
 from typing import NamedTuple
 
-from rigidmd.run.body_summary import LARGE_ENERGY_ERROR
+from rigidmd.run.summary import LARGE_ENERGY_ERROR
 
-RIGHT, REFUSED, TOLD, SILENT, CRASH = "right", "refused", "told", "SILENT", "crash"
-#: Meaning of each verdict; the last two fail the battery.
+RIGHT, REFUSED, REPORTED, UNDETECTED, CRASH = "right", "refused", "reported", "undetected", "crash"
+#: Meaning of each verdict; the last two are failures.
 VERDICTS = {
     RIGHT: "the answer is right within the error stated",
-    REFUSED: "one of the engine's own errors says what is wrong",
-    TOLD: "the answer is wrong, the run went on, and the figures that it reports show it",
-    SILENT: "the answer is wrong and nothing shows it",
-    CRASH: "an error that is not one of the engine's own",
+    REFUSED: "an error message of rigidmd describes what is wrong",
+    REPORTED: "the answer is wrong, the run finished, and the diagnostics that it reports show it",
+    UNDETECTED: "the answer is wrong and nothing shows it",
+    CRASH: "an exception that is not an error of rigidmd",
 }
 #: A run is bounded while the errors of conserved quantities stay below this fraction of the kinetic energy.
 BOUND = 0.1
@@ -25,22 +25,23 @@ DOUBLINGS, RATIO = 10, 1.1
 class Outcome(NamedTuple):
     """The outcome of one run.
 
-    error : against the known answer, in the unit of the case; told : the largest error of a conserved quantity that the
-    run itself reports, relative to kinetic energy or |L|; message : of the rigidmd error that refused or stopped it
+    error : with respect to the known answer, in the unit of the case
+    reported_error : largest error of conserved quantities that the run itself reports, relative to kinetic energy, |L|
+    message : of the rigidmd error that refused or stopped it
     """
 
     error: float = nan
-    told: float = nan
+    reported_error: float = nan
     message: str = ""
     crash: str = ""
     seconds: float = 0.0
 
 
 @dataclass
-class Trial:
+class CaseRun:
     """One run with its expected outcome.
 
-    setting : what was varied, in words; x : the same as a number for the figure; allowed : largest error
+    setting : describes what was varied; x : the same as a number for the figure; allowed : largest error
     """
 
     setting: str
@@ -61,29 +62,25 @@ class Trial:
             return REFUSED
         if seen.error <= self.allowed:
             return RIGHT
-        return TOLD if not seen.told <= LARGE_ENERGY_ERROR and not isnan(seen.told) else SILENT
-
-    @property
-    def as_expected(self) -> bool:
-        """Whether the verdict is one of those expected."""
-        return self.verdict in self.expected
+        reported = not seen.reported_error <= LARGE_ENERGY_ERROR and not isnan(seen.reported_error)
+        return REPORTED if reported else UNDETECTED
 
 
-class Limit(NamedTuple):
+class StepLimit(NamedTuple):
     """The longest bounded step of a family of integrators, and how longer steps fail."""
 
     setting: str
     family: str
     longest: float  # inf if no step tried was too long, 0 if none was short enough
-    beyond: str  # drift, blow-up, detected, SILENT, crash; empty where nothing fails
+    beyond: str  # drift, blow-up, detected, undetected, crash; empty where nothing fails
     message: str
     seconds: float
     curve: tuple[tuple[float, float], ...]  # (step, error that the run reported), by step
 
 
 @dataclass
-class Finding:
-    """All trials and limits of a case. x_title, error_title, step_unit describe its numbers."""
+class CaseResult:
+    """All runs and step limits of a case. x_title, error_title, step_unit describe its numbers."""
 
     name: str
     group: int
@@ -91,96 +88,92 @@ class Finding:
     x_title: str = ""
     error_title: str = ""
     step_unit: str = ""
-    trials: list[Trial] = field(default_factory=list)
-    limits: list[Limit] = field(default_factory=list)
+    runs: list[CaseRun] = field(default_factory=list)
+    limits: list[StepLimit] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     seconds: float = nan
 
     def add(
         self,
-        setting: str,
-        outcome: Outcome,
-        allowed: float = nan,
-        family: str = "",
-        x: float = nan,
-        step: float = nan,
+        setting: str, outcome: Outcome, allowed: float = nan, family: str = "", x: float = nan, step: float = nan,
         expected: tuple[str, ...] = (RIGHT,),
-    ) -> None:
-        self.trials.append(Trial(setting, family, x, step, allowed, expected, outcome))
+    ) -> None:  # fmt: skip
+        self.runs.append(CaseRun(setting, family, x, step, allowed, expected, outcome))
 
     @property
     def families(self) -> list[str]:
-        """Integrators in the order of the trials."""
-        return list(dict.fromkeys([t.family for t in self.trials] + [limit.family for limit in self.limits]))
+        """Integrators in the order of the runs."""
+        return list(dict.fromkeys([t.family for t in self.runs] + [limit.family for limit in self.limits]))
 
     @property
-    def silent(self) -> list[str]:
-        """Failures of the battery, one sentence each."""
+    def failures(self) -> list[str]:
+        """Undetected errors and crashes, a sentence each."""
         found = [
-            f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or SILENT}"
-            for t in self.trials
-            if t.verdict in (SILENT, CRASH)
+            f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or UNDETECTED}"
+            for t in self.runs
+            if t.verdict in (UNDETECTED, CRASH)
         ]
         return found + [
-            f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}: {limit.message or SILENT}"
+            f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}: "
+            f"{limit.message or UNDETECTED}"
             for limit in self.limits
-            if limit.beyond in (SILENT, CRASH)
+            if limit.beyond in (UNDETECTED, CRASH)
         ]
 
     @property
-    def unexpected(self) -> list[Trial]:
-        """Trials with another outcome than expected."""
-        return [trial for trial in self.trials if not trial.as_expected]
+    def unexpected(self) -> list[CaseRun]:
+        """Runs with a verdict that was not expected."""
+        return [run for run in self.runs if run.verdict not in run.expected]
 
 
 def bounded(outcome: Outcome, bound: float = BOUND) -> bool:
     """Whether a run reached its end with all errors of conserved quantities within this bound."""
-    return not outcome.message and not outcome.crash and outcome.told <= bound
+    return not outcome.message and not outcome.crash and outcome.reported_error <= bound
 
 
 def failure(outcome: Outcome) -> str:
-    """How an unbounded run fails; SILENT if nothing reveals the error."""
+    """How an unbounded run fails."""
     if outcome.crash:
         return CRASH
     if outcome.message:
         return "detected"
-    if outcome.told >= 1:
+    if outcome.reported_error >= 1:
         return "blow-up"
-    return "drift" if outcome.told > LARGE_ENERGY_ERROR else SILENT
+    return "drift" if outcome.reported_error > LARGE_ENERGY_ERROR else UNDETECTED
 
 
 def longest_step(
     run: Callable[[float], Outcome], start: float, setting: str = "", family: str = "", bound: float = BOUND
-) -> Limit:
+) -> StepLimit:
     """The longest step that is bounded: doubled or halved from `start`, then bisected.
 
     Runs just beyond the limit and at two and four times it show how it fails. The worst outcome is reported, because a
-    step that is far too long can look stable again.
+    step that is far too long can seem stable again.
     """
     seen: dict[float, Outcome] = {}
 
-    def look(step: float) -> bool:
+    def is_bounded(step: float) -> bool:
         seen[step] = run(step)
         return bounded(seen[step], bound)
 
-    good, bad = (start, inf) if look(start) else (0.0, start)
+    good, bad = (start, inf) if is_bounded(start) else (0.0, start)
     for _ in range(DOUBLINGS):
         if good > 0 and bad < inf:
             break
         step = 2 * good if good > 0 else bad / 2
-        good, bad = (step, bad) if look(step) else (good, step)
+        good, bad = (step, bad) if is_bounded(step) else (good, step)
     while good > 0 and bad < inf and bad > RATIO * good:
         middle = (good * bad) ** 0.5
-        good, bad = (middle, bad) if look(middle) else (good, middle)
+        good, bad = (middle, bad) if is_bounded(middle) else (good, middle)
     beyond = message = ""
     if good > 0 and bad < inf:
-        look(2 * bad)
-        look(4 * bad)
+        is_bounded(2 * bad)
+        is_bounded(4 * bad)
         ways = {failure(outcome): outcome for step, outcome in seen.items() if step >= bad}
-        order = (CRASH, SILENT, "blow-up", "drift", "detected")
+        order = (CRASH, UNDETECTED, "blow-up", "drift", "detected")
         beyond = next(way for way in order if way in ways)
         message = ways[beyond].crash or ways[beyond].message
-    curve = tuple(sorted((step, outcome.told) for step, outcome in seen.items()))
-    return Limit(
+    curve = tuple(sorted((step, outcome.reported_error) for step, outcome in seen.items()))
+    return StepLimit(
         setting, family, inf if bad == inf else good, beyond, message, sum(o.seconds for o in seen.values()), curve
     )

@@ -1,4 +1,4 @@
-"""Water from 0 K to 1e5 K, its longest steps, and equipartition."""
+"""Stability cases: water from 0 K to 1e5 K, its longest steps, and equipartition."""
 
 from math import hypot
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean
-from rigidmd.studies.stability.collisions import bent
-from rigidmd.studies.stability.outcomes import Finding, Outcome, longest_step
-from rigidmd.studies.stability.runs import (
+from rigidmd.studies.stability.cases import (
     QUICK,
     SPLIT,
     WATERS,
-    attempt,
-    case,
     liquid,
     molecules_scene,
+    outcome_of,
+    register_case,
     run_molecules,
     simulate,
     water_scene,
-    weak_heat,
+    weak_thermostat,
 )
+from rigidmd.studies.stability.collisions import bent
+from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 #: Steps (fs) for water; the first is nominal.
@@ -30,8 +30,8 @@ PUBLISHED = 10.0
 FREEDOM = 6 * WATERS - 3
 
 
-@case(9, x="temperature (K)", error="energy error over kinetic energy (at 1 K, of that at 0 K)", step="fs")
-def water_steps(find: Finding, quick: bool) -> None:
+@register_case(9, x="temperature (K)", error="energy error over kinetic energy (at 1 K, of that at 0 K)", step="fs")
+def water_steps(result: CaseResult, quick: bool) -> None:
     """Water at 0 K, 10 K, 298 K, 1000 K and 1e5 K: right at a short step, and the longest step that is bounded."""
     for temperature in (298.0,) if quick else (0.0, 10.0, 298.0, 1000.0, 1e5):
         # a hundredth of an ångström at thermal speed, but stable for librations
@@ -42,35 +42,33 @@ def water_steps(find: Finding, quick: bool) -> None:
             span = (500 if quick else 1000) * step
 
             def at(h: float, family=family, state=state, scale=scale, span=span) -> Outcome:
-                return moved("spce", h, max(200, round(span / h)), family, state, scale)
+                return run_nve("spce", h, max(200, round(span / h)), family, state, scale)
 
-            find.add(f"{temperature:g} K", at(step), 0.02, family, max(temperature, 1.0), step)
-            find.limits.append(longest_step(at, step, f"{temperature:g} K", family))
+            result.add(f"{temperature:g} K", at(step), 0.02, family, max(temperature, 1.0), step)
+            result.limits.append(longest_step(at, step, f"{temperature:g} K", family))
 
 
-@case(9, x="step (fs)", error="energy error over kinetic energy", step="fs")
-def tip4p_steps(find: Finding, quick: bool) -> None:
-    """TIP4P at 300 K at 0.5 to 12 fs; published for it: unstable near 10 fs."""
+@register_case(9, x="step (fs)", error="energy error over kinetic energy", step="fs")
+def tip4p_steps(result: CaseResult, quick: bool) -> None:
+    """TIP4P at 300 K at 0.5 to 12 fs; according to the literature it is unstable near 10 fs."""
     state = warm("tip4p", 300.0, 1.0)
     scale = 0.5 * FREEDOM * BOLTZMANN / KJ_PER_MOL * 300.0
     for family in (SPLIT,) if quick else QUICK:
 
         def at(h: float, family=family) -> Outcome:
-            return moved("tip4p", h, 300 if quick else 1000, family, state, scale)
+            return run_nve("tip4p", h, 300 if quick else 1000, family, state, scale)
 
         for step in STEPS[:1] if quick else STEPS:
-            find.add(
-                f"{step:g} fs", at(step), 0.02 if step <= 1 else 1.0, family, step, step, ("right", "told", "refused")
-            )
+            allowed, expected = 0.02 if step <= 1 else 1.0, (RIGHT, REPORTED, REFUSED)
+            result.add(f"{step:g} fs", at(step), allowed, family, step, step, expected)
         limit = longest_step(at, 4.0, "300 K", family)
-        find.limits.append(limit)
-        find.notes.append(
-            f"{family}: bounded to {limit.longest:.3g} fs (published for rigid TIP4P: near {PUBLISHED:g} fs)"
-        )
+        result.limits.append(limit)
+        published = f"(published for rigid TIP4P: near {PUBLISHED:g} fs)"
+        result.notes.append(f"{family}: bounded to {limit.longest:.3g} fs {published}")
 
 
-def moved(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
-    """An NVE run of water from a state."""
+def run_nve(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
+    """The outcome of an NVE run of water from a state."""
     return run_molecules(water_scene(model, step, steps, family, 0.0), state, scale=scale)
 
 
@@ -78,7 +76,7 @@ def warm(model: str, temperature: float, step: float) -> State:
     """Liquid water at a temperature, reached from 298 K."""
     if temperature == 298.0:
         return liquid(model, 298.0, 1.0, 500)
-    data = water_scene(model, step, 1000, SPLIT, None, weak_heat(temperature, step))
+    data = water_scene(model, step, 1000, SPLIT, None, weak_thermostat(temperature, step))
     return simulate(data, liquid(model, 298.0, 1.0, 500)).state
 
 
@@ -94,33 +92,26 @@ def frozen() -> State:
     return state
 
 
-@case(14, x="step (fs)", error="T_rot - T_trans, in its standard errors", step="fs")
-def equipartition(find: Finding, quick: bool) -> None:
+@register_case(14, x="step (fs)", error="T_rot - T_trans, in its standard errors", step="fs")
+def equipartition(result: CaseResult, quick: bool) -> None:
     """T_trans = T_rot in NVT for linear, symmetric, asymmetric bodies and a mixture with points, at two steps."""
     site = {"mass_u": 12.0, "sigma_A": 3.2, "epsilon_K": 80.0}
     corners = [[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]]
-    species = {
-        "asymmetric": bent(0.5),
-        "linear": bent(0.0, "linear"),
-        "symmetric": {
-            "name": "ring",
-            "sites": [
-                site | {"name": f"R{k}", "position_A": p, "charge_e": q}
-                for k, (p, q) in enumerate(zip(corners, (0.2, 0.2, -0.4), strict=True))
-            ],
-        },
-    }
+    ring = [
+        site | {"name": f"R{k}", "position_A": p, "charge_e": q}
+        for k, (p, q) in enumerate(zip(corners, (0.2, 0.2, -0.4), strict=True))
+    ]
+    species = {"asymmetric": bent(0.5), "linear": bent(0.0, "linear"), "symmetric": {"name": "ring", "sites": ring}}
     points = {"name": "point", "sites": [site | {"name": "P", "position_A": [0.0, 0.0, 0.0]}]}
     mixture = [kind | {"count": 12} for kind in (*species.values(), points)]
-    settings = (
-        {"mixture": mixture} if quick else {k: [v | {"count": 48}] for k, v in species.items()} | {"mixture": mixture}
-    )
-    for words, molecules in settings.items():
+    settings = {} if quick else {name: [kind | {"count": 48}] for name, kind in species.items()}
+    settings |= {"mixture": mixture}
+    for setting, molecules in settings.items():
         for step in (2.0, 8.0):
             steps = 4000 if quick else 10000
             heat = {"temperature_K": 400.0, "thermostat_time_ps": 0.1}
             data = molecules_scene(
-                molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, looks=steps // 10
+                molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, samples=steps // 10
             )
 
             def run(data=data) -> Outcome:
@@ -133,4 +124,4 @@ def equipartition(find: Finding, quick: bool) -> None:
                 gap = abs(rotation - translation) / hypot(its_error, error)
                 return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
 
-            find.add(f"{words}, {step:g} fs", attempt(run), 4.0, SPLIT, step, step)
+            result.add(f"{setting}, {step:g} fs", outcome_of(run), 4.0, SPLIT, step, step)

@@ -1,8 +1,10 @@
-"""The folder of a sweep: its manifest sweep.json, and in a folder each, which are those of runs, its points."""
+"""The folder of a sweep: its manifest sweep.json, and a folder for each point, which is the folder of a run."""
 
 import contextlib
+import hashlib
 import json
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,35 +16,34 @@ from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_em
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json, writing
 from rigidmd.scene.validation import not_none
-from rigidmd.studies.sweep.names import point_name, short_keys
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
-#: While it is there, points that run elsewhere stop at their next look.
+#: While this file exists, points on other machines stop at their next observation.
 STOP = "stop"
 FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
-#: Of the manifest.
+#: Version of the format of the manifest.
 SCHEMA = 1
 WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
 #: The key whose values make replicas.
 SEED = "seed"
+#: Most letters of the name of a folder.
+LONGEST = 120
 
 
-class Schema(BaseModel):
-    """The version of a manifest."""
-
+class ManifestVersion(BaseModel):
     schema_: int = Field(alias="schema")
 
 
 @dataclass
-class Point:
+class SweepPoint:
     """A point of a sweep.
 
     folder : name of its folder
     values : swept key -> value
     scene_sha256 : digest of its scene, as it was read, and of the files that it reads
     ran_sha256 : scene_sha256 of the summary of its run, once it has ended
-    message : of a failed point, why
-    seconds : that it ran, in all
+    message : why a point failed
+    seconds : run time of all attempts
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
@@ -58,7 +59,7 @@ class Point:
 
 @dataclass
 class Manifest:
-    """What a sweep is made of.
+    """The scene, the keys and the points of a sweep.
 
     scene : the file of the scene
     keys : swept key -> the keys that are set together with it, itself first
@@ -75,56 +76,55 @@ class Manifest:
     fixed: dict[str, Any]
     common: dict[str, Any]
     inputs: dict[str, str]
-    points: list[Point] = field(default_factory=list)
+    points: list[SweepPoint] = field(default_factory=list)
     schema: int = SCHEMA
 
-    def overrides(self, point: Point) -> dict[str, Any]:
+    def overrides(self, point: SweepPoint) -> dict[str, Any]:
         """Dotted key -> value of a point, for `Scene.read`."""
         return self.fixed | {key: value for first, value in point.values.items() for key in self.keys[first]}
 
     def folder_of(self, values: dict[str, Any]) -> str:
-        """The name of the folder for what is found over the replicas of a combination of values."""
+        """The name of the folder for means over the replicas of a combination of values."""
         return point_name(values, short_keys(self.keys))
 
-    def combinations(self) -> list[tuple[dict[str, Any], list[Point]]]:
+    def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""
-        found: list[tuple[dict[str, Any], list[Point]]] = []
-        places: dict[str, int] = {}
+        found: list[tuple[dict[str, Any], list[SweepPoint]]] = []
+        index_of: dict[str, int] = {}
         for point in self.points:
             values = {key: value for key, value in point.values.items() if key != SEED}
-            place = places.setdefault(json.dumps(values), len(found))
-            if place == len(found):
+            index = index_of.setdefault(json.dumps(values), len(found))
+            if index == len(found):
                 found.append((values, []))
-            found[place][1].append(point)
+            found[index][1].append(point)
         return found
 
 
 def is_sweep(folder: Path) -> bool:
-    """Whether a folder is that of a sweep."""
     return (folder / MANIFEST).is_file()
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a sweep. Raises OutputError if it is none."""
+    """The manifest of a sweep. Raises OutputError."""
     path, remedy = folder / MANIFEST, "; --force begins the sweep anew"
-    schema = read_json(path, Schema, remedy)
+    schema = read_json(path, ManifestVersion, remedy)
     if schema is None:
-        raise OutputError(f"{path} cannot be read: there is no such file")
+        raise OutputError(f"{path} cannot be read: it does not exist")
     if schema.schema_ > SCHEMA:
         raise OutputError(
             f"{path}: was written by a later rigidmd (version {schema.schema_} of the format; this one reads {SCHEMA})"
         )
     found = not_none(read_json(path, Manifest, remedy))
     names = [point.folder for point in found.points]
-    fault = ""
+    problem = ""
     if any(Path(name).name != name or name in ("", ".", "..") for name in names) or len({*names}) < len(names):
-        fault = "points with names of folders that a sweep does not give"
+        problem = "points with invalid names of folders"
     if any(point.values.keys() != found.keys.keys() for point in found.points):
-        fault = "points without values of all keys"
+        problem = "points without values of all keys"
     if any(key not in together for key, together in found.keys.items()):
-        fault = "keys that are not set with themselves"
-    if fault:
-        raise OutputError(f"{path} is no manifest of a sweep: {fault}{remedy}")
+        problem = "keys that are missing in their own groups"
+    if problem:
+        raise OutputError(f"{path} is not a valid manifest of a sweep: {problem}{remedy}")
     return found
 
 
@@ -134,7 +134,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def check_sweep_folder(folder: Path) -> None:
-    """Raise OutputError if a folder holds what is not of a sweep; changes nothing."""
+    """Raise OutputError if a folder holds other files; changes nothing."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name another folder with -o")
     if not is_empty(folder) and not is_sweep(folder):
@@ -149,29 +149,71 @@ def make_sweep_folder(folder: Path) -> None:
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
-    """Remove what a sweep wrote: its own files, and those of the runs in folders of these names. Raises OutputError."""
+    """Remove the files of a sweep, and the files of runs in folders of these names. Raises OutputError."""
     for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
         if not inner.is_dir() or (inner.is_symlink() and inner != folder):
             continue
         with writing(inner, "cleared"):
             for name in written_by_runs(inner):
-                for own in (inner / name, *offsets_of(inner / name)):
-                    own.unlink(missing_ok=True)
+                for path in (inner / name, *offsets_of(inner / name)):
+                    path.unlink(missing_ok=True)
             (inner / MARKER).unlink(missing_ok=True)
             if inner != folder:
                 (inner / LOCK).unlink(missing_ok=True)
-                with contextlib.suppress(OSError):  # it holds files of others
+                with contextlib.suppress(OSError):  # it holds other files
                     inner.rmdir()
 
 
-def state_on_disk(folder: Path, point: Point) -> str:
-    """What the folder of a point says: finished, interrupted, or waiting if nothing has run there."""
-    own = folder / point.folder
+def state_on_disk(folder: Path, point: SweepPoint) -> str:
+    """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has run there."""
+    inner = folder / point.folder
     try:
-        summary = read_json(own / SUMMARY, Summary) or Summary(interrupted=True)
+        summary = read_json(inner / SUMMARY, Summary) or Summary(interrupted=True)
         ended = not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256)
     except OutputError:
         ended = False
     if ended:
         return FINISHED
-    return INTERRUPTED if (own / MARKER).is_file() else WAITING
+    return INTERRUPTED if (inner / MARKER).is_file() else WAITING
+
+
+def short_keys(keys: Iterable[str]) -> dict[str, str]:
+    """Key -> the shortest end that no other key has: temperature_K of stages.0.temperature_K."""
+    keys = list(keys)
+    found = {}
+    for key in keys:
+        parts = key.split(".")
+        ends = (".".join(parts[-n:]) for n in range(1, len(parts) + 1))
+        alone = (end for end in ends if not any(other != key and f".{other}".endswith(f".{end}") for other in keys))
+        found[key] = re.sub(r"[^\w.+\-]", "-", next(alone, key))
+    return found
+
+
+def value_name(value: Any) -> str:
+    """A value in the name of a folder: letters, digits and . + - only; equal values have equal names."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case float() if value.is_integer() and abs(value) < 1e15:
+            return str(int(value))
+        case int() | float():
+            return repr(value)
+        case list() | tuple() if all(isinstance(one, int | float) for one in value):
+            return "x".join(map(value_name, value))
+    plain = re.sub(r"[^\w.+\-]", "-", str(value)).lstrip(".")
+    if plain == value and len(plain) <= LONGEST // 3:
+        return plain
+    return f"{plain[: LONGEST // 3]}-{hashlib.sha256(repr(value).encode()).hexdigest()[:6]}"
+
+
+def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
+    """The name of a point's folder: temperature_K=280_seed=1."""
+    name = "_".join(f"{short[key]}={value_name(value)}" for key, value in values.items())
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def describe_values(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
+    """Values for messages: temperature_K = 280, seed = 1."""
+    return ", ".join(f"{short[key]} = {value_name(value)}" for key, value in values.items())

@@ -1,28 +1,128 @@
-"""What a sweep has to do: what is asked for, held against what its folder has."""
+"""The points of a sweep: their scenes are read and checked before the first one runs, then merged with its folder."""
 
+import hashlib
+import json
+from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from rigidmd.core.toml import shortened
-from rigidmd.errors import OutputError
-from rigidmd.run.provenance import differences
-from rigidmd.studies.sweep.axes import Axis
+from rigidmd.core.toml import shorten_repr
+from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
+from rigidmd.run.provenance import NOT_COMPARED, differences, keys_of, plain, scene_digest
+from rigidmd.scene import BodyScene, MolecularScene, Scene
+from rigidmd.studies.sweep.axes import Axis, settings
 from rigidmd.studies.sweep.folder import (
     FAILED,
     FINISHED,
+    SEED,
     Manifest,
-    Point,
+    SweepPoint,
     clear_sweep,
+    describe_values,
     is_sweep,
+    point_name,
     read_manifest,
+    short_keys,
     state_on_disk,
 )
 
-#: Differences that are told.
-MOST_TOLD = 8
+#: Largest number of differences in a message.
+MOST_SHOWN = 8
 
 
-def known_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
+def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
+    """The checked points of a sweep over a scene file, and whether the scene is a single body.
+
+    Raises SceneError with all errors of all points.
+    """
+    swept = [axis for axis in axes if axis.swept]
+    keys = {axis.keys[0]: list(axis.keys) for axis in swept}
+    fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
+    short = short_keys(keys)
+    every = settings(axes)
+    digest = Digests()
+    errors: dict[str, list[str]] = {}  # message -> descriptions of the points that have it
+    checked: dict[str, RigidMDError | None] = {}  # values without the seed -> error; one replica is built
+    manifest, scene = None, None
+    for values in every:
+        overrides = fixed | {key: value for first, value in values.items() for key in keys[first]}
+        try:
+            scene = Scene.read(path, overrides)
+            kind = json.dumps({key: value for key, value in values.items() if key != SEED}, default=str)
+            if kind not in checked:
+                checked[kind] = _build_error(scene)
+            if (build_error := checked[kind]) is not None:
+                raise build_error
+        except RigidMDError as error:
+            where = f"{error.where}: " if isinstance(error, InputError) and error.where != str(path) else ""
+            for message in error.errors if isinstance(error, InputError) else [str(error)]:
+                errors.setdefault(f"{where}{message}", []).append(describe_values(values, short))
+            continue
+        if manifest is None:
+            varied = [key for together in keys.values() for key in together]
+            common, inputs = common_part(scene, varied, digest)
+            manifest = Manifest(scene.name, str(Path(path).absolute()), keys, fixed, common, inputs)
+        manifest.points.append(SweepPoint(point_name(values, short), values, digest.of(scene)))
+    if errors or manifest is None:
+        raise SceneError(str(path), [_describe_error(error, points, len(every)) for error, points in errors.items()])
+    return manifest, isinstance(scene, BodyScene)
+
+
+def common_part(scene: Scene, varied: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
+    """Keys of a scene and digests of its inputs, without the swept keys."""
+    keys = keys_of(plain(scene), (*NOT_COMPARED, *varied, *scene.inputs, *scene.embedded_files))
+    keys = {key: str(value) if value in (inf, -inf) else value for key, value in keys.items()}  # JSON has no infinity
+    inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in varied}
+    return keys, inputs
+
+
+class Digests:
+    """Digests of scenes, for which each file is read once."""
+
+    def __init__(self):
+        self._known: dict[Path, str] = {}
+
+    def inputs(self, scene: Scene) -> dict[str, str]:
+        """SHA-256 of each file that a scene reads, by its dotted key. Raises SceneError."""
+        try:
+            for path in scene.inputs.values():
+                if path not in self._known:
+                    self._known[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
+        return {key: self._known[path] for key, path in scene.inputs.items()}
+
+    def of(self, scene: Scene) -> str:
+        """SHA-256 of a scene, as it was read, and of all files that it reads."""
+        text = json.dumps([scene_digest(scene), self.inputs(scene)], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _build_error(scene: MolecularScene | BodyScene) -> RigidMDError | None:
+    """The error that only building the system of a scene raises."""
+    from rigidmd.assemble.body import build_body
+    from rigidmd.assemble.build import build
+
+    try:
+        if not isinstance(scene, BodyScene):
+            build(scene)
+        elif not scene.run.is_auto:
+            build_body(scene)
+    except RigidMDError as error:
+        return error
+    return None
+
+
+def _describe_error(error: str, points: list[str], count: int) -> str:
+    """An error with the points that have it, unless all `count` points have it."""
+    if len(points) == count and count > 1:
+        return error
+    more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
+    return f"at {points[0]}{more}: {error}"
+
+
+def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     """The axes in the order of the sweep in a folder; a single value of a key that it varies is one more value."""
     if not is_sweep(folder):
         return axes
@@ -32,41 +132,39 @@ def known_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     return sorted(known, key=lambda axis: order.index(axis.keys[0]) if axis.keys[0] in order else len(order))
 
 
-def planned(folder: Path, fresh: Manifest, force: bool) -> Manifest:
-    """The manifest of a folder with what is asked for, in place, each point in the state that its folder tells.
+def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> Manifest:
+    """The manifest of a folder with the points of `fresh`, which changes. States are read from the folders.
 
-    A sweep that is there keeps its points, and gets those that are new. force : remove it and begin anew. Raises
-    OutputError, also if the scene is another one.
+    An existing sweep keeps its points. force : remove an existing sweep. Raises OutputError, also if its scene differs.
     """
     if not is_sweep(folder):
         return fresh
     if force:
-        names = _names(folder)
-        clear_sweep(folder, [*names, *(point.folder for point in fresh.points)])
+        clear_sweep(folder, [*_existing_folders(folder), *(point.folder for point in fresh.points)])
         return fresh
     there = read_manifest(folder)
-    if faults := _apart(there, fresh):
-        told = faults[:MOST_TOLD] + ([f"and {len(faults) - MOST_TOLD} more"] if len(faults) > MOST_TOLD else [])
+    if found := _differences_between(there, fresh):
+        shown = found[:MOST_SHOWN] + ([f"and {len(found) - MOST_SHOWN} more"] if len(found) > MOST_SHOWN else [])
         raise OutputError(
-            f"{folder} holds a sweep of another scene: {'; '.join(told)}. --force begins it anew, -o names another "
+            f"{folder} holds a sweep of another scene: {'; '.join(shown)}. --force begins it anew, -o names another "
             "folder"
         )
     known = {point.folder for point in there.points}
     fresh.points = [*there.points, *(point for point in fresh.points if point.folder not in known)]
     for point in fresh.points:
-        settle(folder, point)
+        update_state(folder, point)
     return fresh
 
 
-def settle(folder: Path, point: Point) -> None:
-    """Give a point the state that its folder tells; one that failed stays so until it runs again."""
+def update_state(folder: Path, point: SweepPoint) -> None:
+    """Read the state of a point from its folder; a failed point keeps its state until it runs again."""
     found = state_on_disk(folder, point)
     if found == FINISHED or point.state != FAILED:
         point.state = found
 
 
-def _names(folder: Path) -> list[str]:
-    """Folders of points and of means over replicas that are there; none if the manifest cannot be read."""
+def _existing_folders(folder: Path) -> list[str]:
+    """Folders of points and of means over replicas; none if the manifest cannot be read."""
     try:
         there = read_manifest(folder)
         means = [there.folder_of(values) for values, _ in there.combinations() if values]
@@ -75,28 +173,28 @@ def _names(folder: Path) -> list[str]:
         return []
 
 
-def _apart(there: Manifest, now: Manifest) -> list[str]:
-    """What makes it another sweep: keys that are swept, values of others, files."""
+def _differences_between(there: Manifest, now: Manifest) -> list[str]:
+    """Differences that make another sweep: the keys that vary, values of other keys, files."""
     if there.keys != now.keys:
-        return [f"it varies {_listed(there.keys)}, not {_listed(now.keys)}"]
-    faults = [
-        f"{key} is {_shown(after)}, there {_shown(before)}"
+        return [f"it varies {_list_keys(there.keys)}, not {_list_keys(now.keys)}"]
+    found = [
+        f"{key} is {_format_value(after)}, there {_format_value(before)}"
         for key, (before, after) in differences(there.common, now.common).items()
     ]
-    faults += [f"the file of {key} has changed" for key in differences(there.inputs, now.inputs)]
-    if faults:
-        return faults
+    found += [f"the file of {key} has changed" for key in differences(there.inputs, now.inputs)]
+    if found:
+        return found
     known = {point.folder: point.scene_sha256 for point in there.points}
     return [
-        f"what {point.folder} reads has changed"
+        f"a file that {point.folder} reads has changed"
         for point in now.points
         if known.get(point.folder, point.scene_sha256) != point.scene_sha256
     ]
 
 
-def _listed(keys: dict[str, list[str]]) -> str:
+def _list_keys(keys: dict[str, list[str]]) -> str:
     return " and ".join(", ".join(together) for together in keys.values())
 
 
-def _shown(value: Any) -> str:
-    return value if value == "left out" else shortened(value)
+def _format_value(value: Any) -> str:
+    return value if value == "left out" else shorten_repr(value)

@@ -1,4 +1,4 @@
-"""Worker processes of a sweep, as their parent sees them. One that is killed takes its point with it, and no other."""
+"""Worker processes of a sweep, as their parent sees them. If one is killed, only its point fails."""
 
 import contextlib
 import json
@@ -10,14 +10,14 @@ import sys
 import tempfile
 from typing import Any, NamedTuple
 
-from rigidmd.studies.sweep.worker import Task
+from rigidmd.studies.sweep.worker import PointTask
 
-#: Letters of the end of a worker's standard error that are told when it dies.
-TOLD = 400
+#: Number of the last letters of a worker's standard error that the message about its death may show.
+LAST_LETTERS = 400
 
 
 class Message(NamedTuple):
-    """What a worker says: begun, share, said, warned, ended; or died, with a sentence."""
+    """A message of a worker: begun, fraction, announced, warned, ended; or died, with the reason."""
 
     kind: str
     value: Any
@@ -31,43 +31,42 @@ class Worker:
 
     def __init__(self, threads: int, folder: str | None = None):
         counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the process lives)
-        # In a session of its own: Ctrl-C goes to its parent alone, which ends it with a checkpoint
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the process lives)
+        # In a separate session: Ctrl-C goes only to its parent, which ends it with a checkpoint
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rigidmd.studies.sweep.worker"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said, env=os.environ | counts, cwd=folder,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, env=os.environ | counts, cwd=folder,
             start_new_session=True,
         )  # fmt: skip
         self._rest = b""
-        self.task: Task | None = None
+        self.task: PointTask | None = None
         self._stopped = False
 
     def fileno(self) -> int:
-        """Of its messages, for `select`."""
+        """The descriptor of its messages, for `select`."""
         assert self._process.stdout is not None
         return self._process.stdout.fileno()
 
-    def give(self, task: Task) -> None:
-        """Let it run a task."""
+    def submit(self, task: PointTask) -> None:
         self.task = task
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has died, and its messages will tell
+        with contextlib.suppress(BrokenPipeError):  # it has died, which its messages will show
             self._process.stdin.write(json.dumps(task).encode() + b"\n")
             self._process.stdin.flush()
 
     def messages(self) -> list[Message]:
-        """What it has said since; waits for something. After "ended" and "died" it has no task."""
+        """New messages; waits for one. After "ended" and "died" the worker has no task."""
         read = os.read(self.fileno(), 1 << 16)
         *lines, self._rest = (self._rest + read).split(b"\n")
         found = [Message(*json.loads(line)) for line in lines]
         if not read:
-            found.append(Message("died", self._why()))
+            found.append(Message("died", self._death_reason()))
         if found and found[-1].kind in ("ended", "died"):
             self.task = None
         return found
 
     def stop(self) -> None:
-        """Let its run end at its next look, with a checkpoint. A second call does nothing: it would end it at once."""
+        """Stop the run at its next observation, with a checkpoint. A second signal would end it at once."""
         if not self._stopped:
             self._signal(signal.SIGTERM)
         self._stopped = True
@@ -76,23 +75,23 @@ class Worker:
         self._signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """End it; a run in it ends with a checkpoint."""
+        """End the process; a run in it ends with a checkpoint."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with contextlib.suppress(OSError):
                     pipe.close()
         self._process.wait()
-        self._said.close()
+        self._stderr.close()
 
     def _signal(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(number)
 
-    def _why(self) -> str:
+    def _death_reason(self) -> str:
         code = self._process.wait()
-        self._said.seek(0)
-        said = self._said.read().decode(errors="replace").strip()[-TOLD:].splitlines()
-        last = f": {said[-1]}" if said else ""
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip()[-LAST_LETTERS:].splitlines()
+        last = f": {lines[-1]}" if lines else ""
         if code == -signal.SIGKILL:
             return "its process was killed, perhaps because memory was full (run fewer points at a time: --jobs)"
         if code < 0:
@@ -110,16 +109,16 @@ class Pool:
 
     @property
     def free(self) -> int:
-        """Tasks that it would take now."""
+        """Number of tasks that it would accept now."""
         return self.jobs - len(self._busy)
 
-    def give(self, task: Task) -> None:
+    def submit(self, task: PointTask) -> None:
         worker = self._idle.pop() if self._idle else Worker(self._threads)
-        worker.give(task)
+        worker.submit(task)
         self._busy.append(worker)
 
     def messages(self, seconds: float) -> list[tuple[str, Message]]:
-        """(name of the point, message) of those that come within so many seconds."""
+        """(name of the point, message) of those that come within this time."""
         ready, _, _ = select.select(self._busy, [], [], seconds)
         found = []
         for worker in ready:
@@ -134,7 +133,7 @@ class Pool:
         return found
 
     def stop(self) -> None:
-        """Let all runs end at their next looks, with checkpoints."""
+        """Stop all runs at their next observations, with checkpoints."""
         for worker in self._busy:
             worker.stop()
 

@@ -1,4 +1,4 @@
-"""Analyses of all runs of a sweep: each run by itself, then means over replicas with the errors that these show."""
+"""Analyses of all runs of a sweep: of each run, then means over replicas with errors from their scatter."""
 
 import csv
 from collections.abc import Callable
@@ -7,145 +7,145 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.files import stretch_of, write_findings
-from rigidmd.analysis.findings import Curve, Finding, Value
-from rigidmd.analysis.folder import Task, analyse_folder
+from rigidmd.analysis.files import AnalysisRequest, analyse_folder, describe_range, write_results
+from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import nine_digits, write_csv, writing
-from rigidmd.studies.sweep.folder import FINISHED, Manifest, Point, read_manifest, state_on_disk
-from rigidmd.studies.sweep.names import in_words, short_keys
+from rigidmd.studies.sweep.folder import (
+    FINISHED,
+    Manifest,
+    SweepPoint,
+    describe_values,
+    read_manifest,
+    short_keys,
+    state_on_disk,
+)
 
 ANALYSES = "analysis.csv"
 
 
-class Run(NamedTuple):
-    """What one run gave; its frames are let go. stretch : see `stretch_of`"""
+class AnalysedRun(NamedTuple):
+    """Results of one run, without its frames. frame_range : the frames used, see `describe_range`"""
 
-    findings: list[Finding]
+    results: list[AnalysisResult]
     failed: dict[str, str]
-    stretch: dict[str, Any]
+    frame_range: dict[str, Any]
     files: list[Path]
 
 
 class Combination(NamedTuple):
-    """What was found for one combination of values of the keys but the seed.
+    """Results for one combination of values of the keys without the seed.
 
-    title : the values in words; failed : point or analysis -> why it gave nothing
+    title : describes the values; failed : point or analysis -> why it has no result
     """
 
     title: str
     values: dict[str, Any]
     runs: int
-    findings: list[Finding]
+    results: list[AnalysisResult]
     failed: dict[str, str]
     files: list[Path]
 
 
 def analyse_sweep(
-    folder: Path, task: Task, step: Callable[[float, str], object] = lambda share, name: None
+    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object] = lambda fraction, name: None
 ) -> list[Combination]:
-    """Analyse all finished runs of a sweep, and write means over replicas into its folder, or into one for each
-    combination of the other keys. The values of all stand in analysis.csv. Raises OutputError.
+    """Analyse all finished runs of a sweep. Raises OutputError.
 
-    step : called with the share that is done and what is being done
+    Means over replicas are written into the folder of the sweep, or into a folder for each combination of the other
+    keys, and all values into analysis.csv. progress : called with the fraction that is done and what is being done
     """
     manifest = read_manifest(folder)
     ready = [point for point in manifest.points if state_on_disk(folder, point) == FINISHED]
     if not ready:
-        raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` goes on with it")
-    done: dict[str, Run] = {}
+        raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
+    done: dict[str, AnalysedRun] = {}
     failed: dict[str, str] = {}
     for k, point in enumerate(ready):
 
-        def share(part: float, name: str, k: int = k, point: Point = point) -> None:
-            step((k + part) / len(ready), f"{point.folder} {name}")
+        def report_progress(part: float, name: str, k: int = k, point: SweepPoint = point) -> None:
+            progress((k + part) / len(ready), f"{point.folder} {name}")
 
         try:
-            one = analyse_folder(folder / point.folder, task, share)
-            done[point.folder] = Run(one.findings, one.failed, stretch_of(one.history), one.files)
+            one = analyse_folder(folder / point.folder, request, report_progress)
+            done[point.folder] = AnalysedRun(one.results, one.failed, describe_range(one.frames), one.files)
         except OutputError as error:
             if len(ready) == 1:
                 raise
             failed[point.folder] = str(error)
     if not done:
         raise OutputError(f"{folder}: no point can be analysed: {next(iter(failed.values()))}")
-    found = [_combined(folder, manifest, values, points, done, failed) for values, points in manifest.combinations()]
+    found = [_combine(folder, manifest, values, points, done, failed) for values, points in manifest.combinations()]
     found = [combination for combination in found if combination.runs]
     _write_table(folder, manifest, found)
     return found
 
 
-def _combined(
-    folder: Path,
-    manifest: Manifest,
-    values: dict[str, Any],
-    points: list[Point],
-    done: dict[str, Run],
+def _combine(
+    folder: Path, manifest: Manifest, values: dict[str, Any], points: list[SweepPoint], done: dict[str, AnalysedRun],
     failed: dict[str, str],
-) -> Combination:
-    """Means over the points of a combination, written where there are several."""
-    title = in_words(values, short_keys(manifest.keys))
-    own = [done[point.folder] for point in points if point.folder in done]
+) -> Combination:  # fmt: skip
+    """Means over the points of a combination; they are written if there are several."""
+    title = describe_values(values, short_keys(manifest.keys))
+    runs = [done[point.folder] for point in points if point.folder in done]
     missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
-    if not own:
+    if not runs:
         return Combination(title, values, 0, [], missed, [])
-    findings = over_replicas([one.findings for one in own])
-    names = {finding.name for finding in findings}
-    why = {name: reason for one in own for name, reason in one.failed.items() if name not in names}
-    if len(own) < 2:
-        return Combination(title, values, 1, findings, missed | why, own[0].files)
+    results = over_replicas([run.results for run in runs])
+    names = {result.name for result in results}
+    why = {name: reason for run in runs for name, reason in run.failed.items() if name not in names}
+    if len(runs) < 2:
+        return Combination(title, values, 1, results, missed | why, runs[0].files)
     where = folder / manifest.folder_of(values) if values else folder
     with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    stretch = {
-        "stage": own[0].stretch["stage"],
-        "from_ps": min(one.stretch["from_ps"] for one in own),
-        "to_ps": max(one.stretch["to_ps"] for one in own),
-        "frames": sum(one.stretch["frames"] for one in own),
-        "notes": [f"means over {len(own)} runs, errors from their scatter"],
+    frame_range = {
+        "stage": runs[0].frame_range["stage"],
+        "from_ps": min(run.frame_range["from_ps"] for run in runs),
+        "to_ps": max(run.frame_range["to_ps"] for run in runs),
+        "frames": sum(run.frame_range["frames"] for run in runs),
+        "notes": [f"means over {len(runs)} runs, errors from their scatter"],
     }
-    return Combination(title, values, len(own), findings, missed | why, write_findings(where, stretch, findings, why))
+    return Combination(title, values, len(runs), results, missed | why, write_results(where, frame_range, results, why))
 
 
-def over_replicas(runs: list[list[Finding]]) -> list[Finding]:
-    """Findings of several runs as their means, with the standard errors of these. What a single run alone has found
-    keeps its own error."""
-    found: dict[str, list[Finding]] = {}
-    for findings in runs:
-        for finding in findings:
-            found.setdefault(finding.name, []).append(finding)
-    return [_mean_of(findings, len(runs)) for findings in found.values()]
+def over_replicas(runs: list[list[AnalysisResult]]) -> list[AnalysisResult]:
+    """Means of the results of several runs, with their standard errors; a result of only one run keeps its error."""
+    found: dict[str, list[AnalysisResult]] = {}
+    for results in runs:
+        for result in results:
+            found.setdefault(result.name, []).append(result)
+    return [_mean_of(results, len(runs)) for results in found.values()]
 
 
-def _mean_of(findings: list[Finding], runs: int) -> Finding:
-    """One analysis of several runs."""
-    first = findings[0]
-    if len(findings) == 1:
+def _mean_of(results: list[AnalysisResult], runs: int) -> AnalysisResult:
+    first = results[0]
+    if len(results) == 1:
         return first
-    names = dict.fromkeys(value.name for finding in findings for value in finding.values)
-    values = [_mean_value([v for f in findings for v in f.values if v.name == name], runs) for name in names]
-    files = dict.fromkeys(curve.file for finding in findings for curve in finding.curves)
-    notes, curves = list(dict.fromkeys(note for finding in findings for note in finding.notes)), []
+    names = dict.fromkeys(value.name for result in results for value in result.values)
+    values = [_mean_value([v for f in results for v in f.values if v.name == name], runs) for name in names]
+    files = dict.fromkeys(curve.file for result in results for curve in result.curves)
+    notes, curves = list(dict.fromkeys(note for result in results for note in result.notes)), []
     for file in files:
-        own = [curve for finding in findings for curve in finding.curves if curve.file == file]
-        curve = _mean_curve(own)
+        of_file = [curve for result in results for curve in result.curves if curve.file == file]
+        curve = _mean_curve(of_file)
         if curve is None:
-            notes.append(f"{own[0].label}: the runs have no common range, and there is no mean")
+            notes.append(f"{of_file[0].label}: no mean, because the runs have no common range")
         else:
             curves.append(curve)
-    return Finding(first.name, first.about, values, curves, notes)
+    return AnalysisResult(first.name, first.about, values, curves, notes)
 
 
 def _mean_value(values: list[Value], runs: int) -> Value:
     """The mean of a value over those runs that have it."""
     there = [value.value for value in values if value.value is not None]
     if len(there) < 2:
-        own = next((value for value in values if value.value is not None), values[0])
-        return own._replace(note=f"of one of {runs} runs") if there else own
-    told = f"over {len(there)} runs" + (f" of {runs}; the others gave none" if len(there) < runs else "")
-    return Value(values[0].name, values[0].unit, *mean_and_error(np.array(there)), None, told)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        only = next((value for value in values if value.value is not None), values[0])
+        return only._replace(note=f"of one of {runs} runs") if there else only
+    note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
+    return Value(values[0].name, values[0].unit, *mean_and_error(np.array(there)), None, note)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def mean_and_error(values: np.ndarray) -> tuple[Any, Any]:
@@ -154,7 +154,7 @@ def mean_and_error(values: np.ndarray) -> tuple[Any, Any]:
 
 
 def _mean_curve(curves: list[Curve]) -> Curve | None:
-    """The mean of a curve: on the axis of the first, as far as all reach, the others interpolated where theirs differs.
+    """The mean of curves in their common range, on the axis of the first; other axes are interpolated.
 
     None if they have no range in common.
     """
@@ -184,10 +184,10 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
 def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
     """analysis.csv: a line for each combination, its values with their errors."""
     titles = dict.fromkeys(
-        (finding.name, value.name, value.unit)
+        (result.name, value.name, value.unit)
         for combination in found
-        for finding in combination.findings
-        for value in finding.values
+        for result in combination.results
+        for value in result.values
     )
     keys = list(found[0].values)
     head: list[Any] = [*keys, "runs"]
@@ -196,14 +196,12 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
         head += [header, f"{header} error"]
     lines = [head]
     for combination in found:
-        measured = {
-            (finding.name, value.name, value.unit): value
-            for finding in combination.findings
-            for value in finding.values
+        values_by_title = {
+            (result.name, value.name, value.unit): value for result in combination.results for value in result.values
         }
         line: list[Any] = [_cell(combination.values[key]) for key in keys] + [combination.runs]
         for title in titles:
-            value = measured.get(title)
+            value = values_by_title.get(title)
             line += [None, None] if value is None else [nine_digits(value.value), nine_digits(value.error)]
         lines.append(line)
     add_to_folder(folder, [ANALYSES])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidmd.run.checkpoints import checked_walltime
-from rigidmd.run.signals import handled
+from rigidmd.run.signals import signal_handler
 from rigidmd.scene import Scene
 from rigidmd.studies.sweep.cluster import Cluster
 from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, SweepPoint, write_manifest
@@ -74,7 +74,7 @@ def run_points(
         found.signal = found.signal or number
         pressed += number == signal.SIGINT
 
-    with handled(stop, signal.SIGINT, signal.SIGTERM), contextlib.closing(runner):
+    with signal_handler(stop, signal.SIGINT, signal.SIGTERM), contextlib.closing(runner):
         while True:
             late = ends_at is not None and clock.time() + least > ends_at
             while found.signal is None and not late and runner.free and (point := waiting.next()):

@@ -1,4 +1,4 @@
-"""`rigidmd sweep --to slurm`: a script for an array of jobs, each of which runs a point until it is done."""
+"""`rigidmd sweep --to slurm`: a script for an array of jobs, each of which runs a point until it has finished."""
 
 import shlex
 from collections.abc import Sequence
@@ -8,14 +8,14 @@ from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.studies.sweep.folder import FINISHED, SCRIPT, Manifest
 
-#: Of the wall time of a job: what its run leaves for the end, at most so many seconds and this share.
-SPARE, SPARE_SHARE = 300.0, 0.1
+#: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this fraction.
+SPARE, SPARE_FRACTION = 300.0, 0.1
 
 JOB = """#!/bin/bash
 # {count} points of {name}. Submit it: sbatch {script}
-# A job whose time is up submits itself again, and goes on from its checkpoint. When all have ended,
+# A job whose time is up submits itself again, and continues from its checkpoint. When all have ended,
 #   {collect}
-# writes table and figure; `rigidmd sweep` with --to slurm as before writes a script of those that are not finished.
+# writes table and figure; `rigidmd sweep` with --to slurm writes a script of the points that have not finished.
 #SBATCH --job-name={job}
 #SBATCH --array={array}
 #SBATCH --time={time}
@@ -33,9 +33,9 @@ exit $code
 def write_script(
     folder: Path, manifest: Manifest, walltime: float, threads: int, trust: Sequence[str], again: int
 ) -> tuple[Path, int]:
-    """Write sweep.sbatch for the points that have not finished. Returns it and their number.
+    """Write sweep.sbatch for the points that have not finished. Returns its path and their number.
 
-    walltime : of a job, s; again : exit code of a run whose time was up. Raises OutputError.
+    walltime : wall time of a job, s; again : exit code of a run whose time was up. Raises OutputError.
     """
     path = folder.absolute() / SCRIPT
     left = [k for k, point in enumerate(manifest.points) if point.state != FINISHED]
@@ -48,9 +48,9 @@ def write_script(
         count=len(left),
         name=in_comment(manifest.name),
         job=f"{as_word(manifest.name)}-sweep",
-        array=in_ranges(left),
-        time=in_hours(walltime),
-        inner=in_hours(walltime - min(SPARE, SPARE_SHARE * walltime)),
+        array=format_ranges(left),
+        time=format_walltime(walltime),
+        inner=format_walltime(walltime - min(SPARE, SPARE_FRACTION * walltime)),
         threads=threads,
         folder=str(folder.absolute()).replace("%", "%%"),  # Slurm replaces %j and others
         here=shlex.quote(here),
@@ -63,7 +63,7 @@ def write_script(
     return path, len(left)
 
 
-def in_ranges(numbers: Sequence[int]) -> str:
+def format_ranges(numbers: Sequence[int]) -> str:
     """Ascending numbers as Slurm's --array has them: 0-3,7."""
     parts: list[list[int]] = []
     for number in numbers:
@@ -74,7 +74,7 @@ def in_ranges(numbers: Sequence[int]) -> str:
     return ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in parts)
 
 
-def in_hours(span: float) -> str:
+def format_walltime(span: float) -> str:
     """Seconds as H:MM:SS."""
     whole = int(span)
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"

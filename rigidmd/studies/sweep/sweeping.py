@@ -1,4 +1,4 @@
-"""A sweep from what is wanted to its table: points checked, folder opened, points run, table and figure written."""
+"""`rigidmd sweep`: points are checked, the folder is opened, points run, table and figure are written."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import default_name, read_tables
-from rigidmd.studies.sweep.axes import Axis, axes_of, checked
+from rigidmd.studies.sweep.axes import Axis, axes_of, check_axes
 from rigidmd.studies.sweep.cluster import Cluster
 from rigidmd.studies.sweep.figure import draw_sweep
 from rigidmd.studies.sweep.folder import (
@@ -25,12 +25,11 @@ from rigidmd.studies.sweep.folder import (
     read_manifest,
     write_manifest,
 )
-from rigidmd.studies.sweep.plan import known_axes, planned, settle
-from rigidmd.studies.sweep.points import points_of
+from rigidmd.studies.sweep.plan import merge_manifests, order_axes, read_points, update_state
 from rigidmd.studies.sweep.processes import Pool
 from rigidmd.studies.sweep.running import Runner, run_points, task_of
 from rigidmd.studies.sweep.table import Table, table_of, write_table
-from rigidmd.studies.sweep.worker import Ended, Tell, run_task
+from rigidmd.studies.sweep.worker import PointResult, Send, run_task
 
 
 def cores() -> int:
@@ -38,15 +37,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class Wanted(NamedTuple):
-    """A sweep that is wanted.
+class SweepRequest(NamedTuple):
+    """What the user asks for.
 
     path : the scene file
-    axes : what is set, see `parse_axis`
+    axes : keys and their values, see `parse_axis`
     folder : default: runs/NAME-sweep
-    replicas : so many seeds, from that of the scene on
+    replicas : number of seeds, from the seed of the scene on
     trust : Python files that the scene may run
-    force : remove what is in the folder
+    force : remove the sweep in the folder
     """
 
     path: Path
@@ -57,7 +56,7 @@ class Wanted(NamedTuple):
     force: bool = False
 
 
-class Opened(NamedTuple):
+class OpenSweep(NamedTuple):
     """A sweep with its folder, in which no other sweep runs."""
 
     folder: Path
@@ -70,38 +69,37 @@ class Opened(NamedTuple):
         return sum(point.state != FINISHED for point in self.manifest.points)
 
 
-def opened(wanted: Wanted, stack: ExitStack) -> Opened:
-    """Check all points, hold them against the folder, and write the manifest. No other sweep runs there until the
-    stack ends.
+def open_sweep(request: SweepRequest, stack: ExitStack) -> OpenSweep:
+    """Check all points, compare them with the folder, and write the manifest.
 
-    Raises SceneError, OutputError.
+    No other sweep can run in the folder until the stack ends. Raises SceneError, OutputError.
     """
     from rigidmd.assemble.user_code.trust import trust
 
-    for path in wanted.trust:
+    for path in request.trust:
         trust(path)
-    data, _ = read_tables(wanted.path)
-    axes = wanted.axes if wanted.replicas is None else _with_seeds(wanted, data)
+    data, _ = read_tables(request.path)
+    axes = request.axes if request.replicas is None else _with_seeds(request, data)
     keys = [key for axis in axes for key in axis.keys]
-    if wanted.trust and not any("module" in str(told) for told in (data.get("forces"), keys)):
-        raise SceneError("--trust", [f"{wanted.path} names no Python file by module in [[forces.custom]]"])
+    if request.trust and not any("module" in str(part) for part in (data.get("forces"), keys)):
+        raise SceneError("--trust", [f"{request.path} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
-    folder = wanted.folder or Path("runs") / f"{named or default_name(wanted.path)}-sweep"
+    folder = request.folder or Path("runs") / f"{named or default_name(request.path)}-sweep"
     check_sweep_folder(folder)
-    axes = checked(axes if wanted.force else known_axes(folder, axes))
-    asked, is_body = points_of(wanted.path, axes)
+    axes = check_axes(axes if request.force else order_axes(folder, axes))
+    fresh, is_body = read_points(request.path, axes)
     lock = FolderLock(folder)
     stack.callback(lock.release)
     lock.take()
-    manifest = planned(folder, asked, wanted.force)
+    manifest = merge_manifests(folder, fresh, request.force)
     make_sweep_folder(folder)
     lock.take()
     write_manifest(folder, manifest)
-    return Opened(folder, manifest, is_body)
+    return OpenSweep(folder, manifest, is_body)
 
 
-def opened_again(folder: Path, stack: ExitStack) -> Opened:
-    """A sweep that is there, its points in the states that their folders tell. Raises OutputError."""
+def open_existing_sweep(folder: Path, stack: ExitStack) -> OpenSweep:
+    """An existing sweep; the states of its points are read from their folders. Raises OutputError."""
     if not is_sweep(folder):
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
     lock = FolderLock(folder)
@@ -109,29 +107,27 @@ def opened_again(folder: Path, stack: ExitStack) -> Opened:
     lock.take()
     manifest = read_manifest(folder)
     for point in manifest.points:
-        settle(folder, point)
+        update_state(folder, point)
     write_manifest(folder, manifest)
-    return Opened(folder, manifest, False)
+    return OpenSweep(folder, manifest, False)
 
 
-def _with_seeds(wanted: Wanted, data: Mapping[str, Any]) -> list[Axis]:
-    """The axes with the seeds of replicas, from that of the scene on."""
+def _with_seeds(request: SweepRequest, data: Mapping[str, Any]) -> list[Axis]:
+    """The axes with an axis of the seeds of replicas."""
     if "body" in data:
-        raise SceneError("--replicas", [f"{wanted.path} is a single body, whose motion has no seed"])
-    own = [axis for axis in wanted.axes if SEED in axis.keys]
-    if any(axis.swept or len(axis.keys) > 1 for axis in own):
-        raise SceneError("--replicas", ["are seeds, and --set gives them too; leave out one of them"])
-    seed = own[0].values[0] if own else data.get(SEED, MolecularScene.model_fields[SEED].default)
+        raise SceneError("--replicas", [f"{request.path} is a single body, whose motion has no seed"])
+    with_seed = [axis for axis in request.axes if SEED in axis.keys]
+    if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
+        raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
+    seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
-        raise SceneError(str(wanted.path), [f"seed is {shorten_repr(seed)}, must be a whole number"])
-    return [
-        *(axis for axis in wanted.axes if axis not in own),
-        Axis((SEED,), tuple(range(seed, seed + (wanted.replicas or 1)))),
-    ]
+        raise SceneError(str(request.path), [f"seed is {shorten_repr(seed)}, must be a whole number"])
+    seeds = Axis((SEED,), tuple(range(seed, seed + (request.replicas or 1))))
+    return [*(axis for axis in request.axes if axis not in with_seed), seeds]
 
 
-def shares(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
-    """Points at a time, and threads of each, so that all cores have work; what is given stays."""
+def jobs_and_threads(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
+    """Points at a time, and threads of each, so that all cores have work. Given numbers are kept."""
     most = cores()
     if threads is None and jobs is None:
         jobs = max(1, min(most, count))
@@ -141,15 +137,9 @@ def shares(count: int, jobs: int | None, threads: int | None, is_body: bool) -> 
 
 
 def sweep(
-    scene: str | Path,
-    sets: Mapping[str, Any],
-    folder: str | Path | None = None,
-    *,
-    jobs: int | None = None,
-    threads: int | None = None,
-    force: bool = False,
-    trust: Sequence[str] = (),
-) -> Table:
+    scene: str | Path, sets: Mapping[str, Any], folder: str | Path | None = None, *, jobs: int | None = None,
+    threads: int | None = None, force: bool = False, trust: Sequence[str] = (),
+) -> Table:  # fmt: skip
     """Run a scene file at many points in parallel, and return the table of means and errors, as `rigidmd sweep` does.
 
     table = rigidmd.sweep("water.toml", {"stages.0.temperature_K": [280, 290], "seed": range(1, 9)}, jobs=2)
@@ -159,19 +149,20 @@ def sweep(
     folder : default: runs/NAME-sweep. Points that have finished there are not run again
     jobs, threads : points at a time, threads of each; default: so that all cores have work
 
-    Raises SceneError and OutputError before anything runs, SimulationError if points failed (`sweep.json` tells why),
-    KeyboardInterrupt after Ctrl-C; the same call goes on.
+    Raises SceneError and OutputError before anything runs, SimulationError if points failed (`sweep.json` has
+    the reasons), KeyboardInterrupt after Ctrl-C. The same call continues a sweep.
     """
-    wanted = Wanted(Path(scene), axes_of(sets), None if folder is None else Path(folder), trust=trust, force=force)
+    request = SweepRequest(
+        Path(scene), axes_of(sets), None if folder is None else Path(folder), trust=trust, force=force
+    )
     with ExitStack() as stack:
-        there = opened(wanted, stack)
+        there = open_sweep(request, stack)
         manifest = there.manifest
-        outcome = run_points(
-            there.folder, manifest, Pool(*shares(there.left, jobs, threads, there.is_body)), trust=trust
-        )
+        pool = Pool(*jobs_and_threads(there.left, jobs, threads, there.is_body))
+        outcome = run_points(there.folder, manifest, pool, trust=trust)
         if outcome.signal is not None:
             raise KeyboardInterrupt
-        table, _ = collected(there.folder, manifest)
+        table, _ = collect(there.folder, manifest)
     for point in manifest.points:
         if point.state != FINISHED:
             count = len(outcome.failed) + len(outcome.left)
@@ -180,8 +171,8 @@ def sweep(
     return table
 
 
-def collected(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
-    """The table of what has finished, and the files with table and figure. Raises OutputError."""
+def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
+    """The table of the finished points, and the files with table and figure. Raises OutputError."""
     table = table_of(folder, manifest)
     if not any(row.runs for row in table.rows):
         return table, []
@@ -190,11 +181,11 @@ def collected(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
 
 
 def run_point(
-    folder: Path, k: int, scene: Path, walltime: float | None, trust: Sequence[str], tell: Tell
-) -> tuple[str, Ended]:
-    """Run one point of a sweep that is there, in this process: its name, and how it ended. Raises OutputError.
+    folder: Path, k: int, scene: Path, walltime: float | None, trust: Sequence[str], send: Send
+) -> tuple[str, PointResult]:
+    """Run point k of an existing sweep in this process: its name, and how it ended. Raises OutputError.
 
-    scene : its file; that of the manifest is not believed
+    scene : the scene file; the path in the manifest is not trusted
     """
     if not is_sweep(folder):
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
@@ -203,11 +194,11 @@ def run_point(
         raise OutputError(f"{folder} has points 0 to {len(manifest.points) - 1}, not {k}")
     point, manifest.scene = manifest.points[k], str(scene.absolute())
     ends_at = None if walltime is None else time.time() + walltime
-    return point.folder, run_task(task_of(folder, manifest, point, ends_at, trust), tell, progress=True)
+    return point.folder, run_task(task_of(folder, manifest, point, ends_at, trust), send, progress=True)
 
 
 def runner_of(folder: Path, scheduler: str | None, jobs: int, threads: int) -> Runner:
-    """Processes here, or a cluster of dask with `threads` for each point. Raises SettingError."""
+    """Processes on this machine, or a cluster of dask with `threads` for each point. Raises SettingError."""
     if scheduler is None:
         return Pool(jobs, threads)
     return Cluster(scheduler, jobs, threads, folder, Path.cwd())

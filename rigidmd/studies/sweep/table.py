@@ -9,48 +9,48 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.analysis.source import production_of
-from rigidmd.core.statistics import mean, standard_error, with_error
-from rigidmd.engines.columns import BODY_COLUMNS
-from rigidmd.engines.samples import COLUMNS
+from rigidmd.analysis.source import production_samples
+from rigidmd.core.statistics import format_with_error, mean, standard_error
+from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
 from rigidmd.errors import RigidMDError
 from rigidmd.io.write import columns_text, nine_digits, write_csv
 from rigidmd.run.record import Record, read_record
-from rigidmd.studies.sweep.folder import FINISHED, TABLE, Manifest
-from rigidmd.studies.sweep.names import short_keys, value_name
+from rigidmd.studies.sweep.folder import FINISHED, TABLE, Manifest, short_keys, value_name
 
 if TYPE_CHECKING:
     import pandas
 
-#: Columns of the log whose means say nothing.
-LEFT_OUT = {"step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved"}
+#: Columns of the log whose means have no meaning.
+LEFT_OUT = {
+    "step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved",
+}  # fmt: skip
 POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
-#: Columns that a person reads, where there are any: of molecules, of a body.
+#: Columns of the printed table and the figure: for molecules, for a body.
 MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
 MAIN_OF_BODY = (
     "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest", "L_size_error largest",
 )  # fmt: skip
-#: What they are called where there is little room.
+#: Short titles for the printed table.
 SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}
-#: Columns of a body that the table leaves out: rotation in its other forms.
+#: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
 NOT_OF_BODY = ("time", "orthogonality_error")
 
-#: A value and its error; None without one.
+#: A value and its error, or None.
 Measured = tuple[float, float | None]
 
 
 @dataclass
-class Row:
-    """A combination of values of all keys but the seed, and what its runs gave.
+class SweepRow:
+    """A combination of values of all keys but the seed, and the results of its runs.
 
-    runs : value of the seed, None if it is not swept -> column -> value and its own error, of each run
+    runs : value of the seed, None if it is not swept -> column -> value and error of that run
     """
 
     values: dict[str, Any]
     runs: dict[Any, dict[str, Measured]] = field(default_factory=dict)
 
     def __getitem__(self, column: str) -> Measured:
-        """Mean over the runs, and its standard error over them; of one run its own. NaN without a value."""
+        """Mean over the runs and its standard error; for one run its value and error. NaN without a value."""
         found = [run[column] for run in self.runs.values() if column in run]
         if len(found) < 2:
             return found[0] if found else (nan, None)
@@ -62,15 +62,15 @@ class Row:
 
 @dataclass
 class Table:
-    """What a sweep gave: a row for each combination of values, columns of means and errors.
+    """Results of a sweep: a row for each combination of values, columns of means and errors.
 
     table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature (K)") of their errors,
-    table["seed"] of the values of a key. failed : point -> why it gave nothing
+    table["seed"] of the values of a key. failed : point -> why it has no results
     """
 
     folder: Path
     keys: list[str]
-    rows: list[Row]
+    rows: list[SweepRow]
     columns: list[str]
     failed: dict[str, str] = field(default_factory=dict)
 
@@ -88,12 +88,12 @@ class Table:
         return np.array([row[column][0] for row in self.rows])
 
     def error(self, column: str) -> np.ndarray:
-        """Standard errors of a column of means: over the runs of a row, of a single run its own; NaN without one."""
+        """Standard errors of a column of means: over the runs of a row, or of its single run; NaN without one."""
         self._check(column)
         return np.array([nan if (error := row[column][1]) is None else error for row in self.rows])
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The table as sweep.csv has it. Raises ImportError without pandas."""
+        """The table of sweep.csv. Raises ImportError without pandas."""
         try:
             import pandas
         except ImportError:
@@ -129,12 +129,12 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
     """The table of the points that have finished."""
     rows, columns, failed = [], {}, {}
     for values, points in manifest.combinations():
-        row = Row(values)
+        row = SweepRow(values)
         for point in points:
             if point.state != FINISHED:
                 continue
             try:
-                found = measured(read_record(folder / point.folder))
+                found = summarise_run(read_record(folder / point.folder))
             except RigidMDError as error:
                 failed[point.folder] = str(error)
                 continue
@@ -144,8 +144,8 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
     return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed)
 
 
-def measured(record: Record) -> dict[str, Measured]:
-    """What a run gives: of molecules means over the production of its last stage, of a body figures of its motion.
+def summarise_run(record: Record) -> dict[str, Measured]:
+    """Results of a run: for molecules means over the production of its last stage, for a body figures of its motion.
 
     Raises OutputError.
     """
@@ -153,16 +153,16 @@ def measured(record: Record) -> dict[str, Measured]:
 
 
 def _of_molecules(record: Record) -> dict[str, Measured]:
-    _, own = production_of(record)
+    _, production = production_samples(record)
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
         if name in LEFT_OUT:
             continue
-        average, error = mean(values[own])
+        average, error = mean(values[production])
         if average is None:
             continue
-        if np.ptp(values[own]) == 0:
-            average, error = float(values[own][0]), 0.0
+        if np.ptp(values[production]) == 0:
+            average, error = float(values[production][0]), 0.0
         found[COLUMNS[name].header] = average, error
         if name == "potential":
             n = len(record.molecules.model.species)
@@ -176,11 +176,8 @@ def _of_molecules(record: Record) -> dict[str, Measured]:
 def _of_body(record: Record) -> dict[str, Measured]:
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
-        if (
-            name in NOT_OF_BODY
-            or name[:2] in ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
-            or not np.isfinite(values).all()
-        ):
+        is_rotation = name[:2] in ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
+        if name in NOT_OF_BODY or is_rotation or not np.isfinite(values).all():
             continue
         unit = BODY_COLUMNS[name].unit if name in BODY_COLUMNS else "1"
         if name.endswith("_error"):
@@ -198,16 +195,16 @@ def write_table(table: Table) -> Path:
 
 
 def table_text(table: Table) -> str:
-    """The main columns as a person reads them."""
+    """The main columns as text."""
     short = short_keys(table.keys)
     shown = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
     lines = [[*short.values(), "runs", *(SHORT.get(column, column) for column in shown)]]
     for row in table.rows:
         cells = [value_name(row.values[key]) for key in table.keys] + [str(len(row.runs))]
-        lines.append([*cells, *(_told(row, column) for column in shown)])
+        lines.append([*cells, *(_format_cell(row, column) for column in shown)])
     return columns_text(lines, left=())
 
 
-def _told(row: Mapping[str, Measured] | Row, column: str) -> str:
+def _format_cell(row: Mapping[str, Measured] | SweepRow, column: str) -> str:
     value, error = row[column]
-    return "-" if not np.isfinite(value) else with_error(value, error)
+    return "-" if not np.isfinite(value) else format_with_error(value, error)

@@ -1,7 +1,7 @@
 """A process that runs points of a sweep, one after another: `python -m rigidmd.studies.sweep.worker`.
 
 Each line of its standard input is a task, each line of its output a message, both JSON. It ends with its input: when
-whoever started it has died, it stops with a checkpoint.
+its parent process has died, it stops with a checkpoint.
 """
 
 import contextlib
@@ -18,18 +18,18 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from rigidmd.errors import RigidMDError
-from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, Point, state_on_disk
+from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, SweepPoint, state_on_disk
 
-#: Looks at a run for its progress.
-LOOKS = 100
+#: Number of progress messages of a run.
+PROGRESS_REPORTS = 100
 #: Seconds to wait for a run in the folder of a point that is about to stop: its sweep was killed, or dask moved it.
-PATIENCE = 120.0
+LOCK_TIMEOUT = 120.0
 
-Tell = Callable[[str, Any], None]
+Send = Callable[[str, Any], None]
 
 
-class Task(TypedDict):
-    """One point, in words that JSON has.
+class PointTask(TypedDict):
+    """One point, as JSON.
 
     folder : of the sweep; name : of the point's folder in it; sha256 : digest of its scene
     ends_at : `time.time()` at which it has to have ended; None for never
@@ -45,7 +45,7 @@ class Task(TypedDict):
     ends_at: float | None
 
 
-class Ended(TypedDict):
+class PointResult(TypedDict):
     """How a point ended. sha256 : scene_sha256 of its summary."""
 
     state: str
@@ -55,15 +55,15 @@ class Ended(TypedDict):
     out_of_time: bool
 
 
-def run_task(task: Task, tell: Tell = lambda kind, value: None, progress: bool = False) -> Ended:
-    """Run a point in its folder, from its last checkpoint if it has one. A point that has finished is left as it is.
+def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: bool = False) -> PointResult:
+    """Run a point in its folder, from its last checkpoint if it has one; a point that has finished is not run again.
 
-    tell : called with ("begun", None) when it is compiled, ("share", share that is done), ("warned", sentence)
+    send : called with ("begun", None) when it is compiled, ("fraction", fraction done), ("announced" or "warned", text)
     """
     began = clock.monotonic()
-    ended: Ended = {"state": FAILED, "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
+    ended: PointResult = {"state": FAILED, "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
     try:
-        _run(task, tell, progress, ended)
+        _run(task, send, progress, ended)
     except RigidMDError as error:
         ended["message"] = str(error)
     except KeyboardInterrupt:
@@ -77,17 +77,17 @@ def run_task(task: Task, tell: Tell = lambda kind, value: None, progress: bool =
     return ended
 
 
-def _run(task: Task, tell: Tell, progress: bool, ended: Ended) -> None:
+def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> None:
     from rigidmd.assemble.user_code.trust import trust
     from rigidmd.run import Every, Observer, Simulation
     from rigidmd.scene import BodyScene, MolecularScene, Scene
-    from rigidmd.studies.sweep.points import Digests
+    from rigidmd.studies.sweep.plan import Digests
 
     class Begun(Observer):
-        """Tells when the first step is about to be taken."""
+        """Sends a message before the first step."""
 
         def begin(self, run: Simulation) -> None:
-            tell("begun", None)
+            send("begun", None)
 
     for path in task["trust"]:
         trust(path)
@@ -95,8 +95,8 @@ def _run(task: Task, tell: Tell, progress: bool, ended: Ended) -> None:
     if Digests().of(scene) != task["sha256"]:
         raise RigidMDError(f"{task['scene']} or a file that it reads has changed since the sweep began")
     sweep, folder = Path(task["folder"]), Path(task["folder"]) / task["name"]
-    wait_for_others(folder)
-    point = Point(task["name"], {}, task["sha256"], ran_sha256=task["ran_sha256"])
+    wait_for_folder(folder)
+    point = SweepPoint(task["name"], {}, task["sha256"], ran_sha256=task["ran_sha256"])
     if state_on_disk(sweep, point) == FINISHED:
         ended["state"], ended["sha256"] = FINISHED, task["ran_sha256"]
         return
@@ -107,11 +107,13 @@ def _run(task: Task, tell: Tell, progress: bool, ended: Ended) -> None:
     else:
         whole = scene.run.duration_s if isinstance(scene, BodyScene) else 0.0
     if whole > 0:
-        observers.append(Every(whole / LOOKS, lambda moment: tell("share", min(1.0, moment.time / whole))))
-    resume = scene.output.checkpoint_minutes is not False  # without checkpoints it begins again
+        observers.append(
+            Every(whole / PROGRESS_REPORTS, lambda moment: send("fraction", min(1.0, moment.time / whole)))
+        )
+    resume = scene.output.checkpoint_minutes is not False  # without checkpoints it starts again
     simulation = Simulation(
-        scene, folder, not resume, observers=observers, say=lambda sentence: tell("said", sentence),
-        warn=lambda sentence: tell("warned", sentence), resume=resume, walltime=walltime,
+        scene, folder, not resume, observers=observers, say=lambda sentence: send("announced", sentence),
+        warn=lambda sentence: send("warned", sentence), resume=resume, walltime=walltime,
     )  # fmt: skip
     results = simulation.run(progress=progress)
     ended["state"] = INTERRUPTED if results.interrupted else FINISHED
@@ -119,8 +121,8 @@ def _run(task: Task, tell: Tell, progress: bool, ended: Ended) -> None:
     ended["out_of_time"] = results.out_of_time
 
 
-def wait_for_others(folder: Path, patience: float = PATIENCE) -> None:
-    """Wait until no other run writes in a folder. Raises OutputError when patience is at its end."""
+def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
+    """Wait until no other run writes in a folder. Raises OutputError after the timeout."""
     from filelock import FileLock, Timeout
 
     from rigidmd.errors import OutputError
@@ -128,10 +130,10 @@ def wait_for_others(folder: Path, patience: float = PATIENCE) -> None:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / LOCK, timeout=patience):
+        with FileLock(folder / LOCK, timeout=timeout):
             pass
     except Timeout:
-        raise OutputError(f"another run is writing in {folder}, and did not end within {patience:g} s") from None
+        raise OutputError(f"another run is writing in {folder}, and did not end within {timeout:g} s") from None
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
 
@@ -139,22 +141,22 @@ def wait_for_others(folder: Path, patience: float = PATIENCE) -> None:
 def main() -> None:
     """Run tasks until standard input ends."""
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what others print is no message
-    tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+    os.dup2(2, 1)  # what others print must not be read as a message
+    tasks: queue.SimpleQueue[PointTask | None] = queue.SimpleQueue()
 
     def read() -> None:
         for line in sys.stdin:
             tasks.put(json.loads(line))
         tasks.put(None)
-        os.kill(os.getpid(), signal.SIGTERM)  # a run stops at its next look
+        os.kill(os.getpid(), signal.SIGTERM)  # a run stops at its next observation
 
-    def tell(kind: str, value: Any) -> None:
-        with contextlib.suppress(BrokenPipeError):  # nobody listens any more: the run is stopping
+    def send(kind: str, value: Any) -> None:
+        with contextlib.suppress(BrokenPipeError):  # the parent has died: the run is stopping
             print(json.dumps([kind, value]), file=channel, flush=True)
 
     threading.Thread(target=read, daemon=True).start()
     while (task := tasks.get()) is not None:
-        tell("ended", run_task(task, tell))
+        send("ended", run_task(task, send))
     os._exit(0)
 
 

@@ -1,9 +1,8 @@
-"""The command `sweep`. It prints and never computes."""
+"""`rigidmd sweep`."""
 
 import argparse
 import shlex
 import sys
-from collections.abc import Callable
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,48 +12,46 @@ from rigidmd.commands.arguments import (
     FAILED,
     INTERRUPTED,
     OUT_OF_TIME,
+    Commands,
+    add_command,
+    add_output_folder,
     add_trust,
+    command_line,
     number,
-    say,
     seconds,
-    warn,
-)
+)  # fmt: skip
+from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import visible
 
 if TYPE_CHECKING:
     from rigidmd.io.progress import Bar
     from rigidmd.studies.sweep.folder import Manifest
-    from rigidmd.studies.sweep.sweeping import Opened
+    from rigidmd.studies.sweep.sweeping import OpenSweep
     from rigidmd.studies.sweep.table import Table
 
 
-def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add it with `add(name, function, about, example)`."""
-    sweep = add(
-        "sweep",
-        _sweep,
+def add(commands: Commands) -> None:
+    sweep = add_command(
+        commands, "sweep", _sweep,
         "run a scene at many points, a folder each, with a table and a figure of means and errors",
         "rigidmd sweep water.toml --set stages.0.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
         "  rigidmd sweep water.toml --replicas 8\n"
         "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
-    )
+    )  # fmt: skip
     count = number(int, 1, 4096, "a number from 1 to 4096")
     seeds = number(int, 2, 10000, "a number of replicas from 2 on")
     index = number(int, 0, inf, "the number of a point, from 0 on")
     sweep.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
     sweep.add_argument(
         "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
-        help="values of a key of the scene, one after another; KEY=1..8 for whole numbers; KEY=VALUE the same for all; "
-        "KEY,KEY=A,B for keys that go together; may be repeated: all combinations run",
+        help="values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for whole numbers; "
+        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run",
     )  # fmt: skip
     sweep.add_argument(
-        "--replicas", type=seeds, metavar="N", help="N seeds, from that of the scene on: errors from their scatter"
+        "--replicas", type=seeds, metavar="N", help="run N seeds, from the scene's seed on: errors from their scatter"
     )
-    sweep.add_argument("-o", "--output", metavar="DIR", help="folder (default: runs/NAME-sweep)")
-    sweep.add_argument("--force", action="store_true", help="remove an earlier sweep in that folder and begin anew")
-    sweep.add_argument(
-        "--jobs", type=count, metavar="N", help="points at a time (default: so many that cores are full)"
-    )
+    add_output_folder(sweep, "runs/NAME-sweep", "an earlier sweep")
+    sweep.add_argument("--jobs", type=count, metavar="N", help="points at a time (default: as many as fill all cores)")
     sweep.add_argument("--threads", type=count, metavar="N", help="threads of each point (default: cores over jobs)")
     sweep.add_argument(
         "--walltime", type=seconds, metavar="H:MM:SS",
@@ -68,11 +65,11 @@ def add_commands(add: Callable[..., argparse.ArgumentParser]) -> None:
         "--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"
     )
     sweep.add_argument(
-        "--collect", action="store_true", help="run nothing, and write table and figure of what is there"
+        "--collect", action="store_true", help="run nothing, and write table and figure of existing results"
     )
-    sweep.add_argument("--point", type=index, metavar="K", help="run point K of a sweep that is there, from 0 on")
+    sweep.add_argument("--point", type=index, metavar="K", help="run point K of an existing sweep, counted from 0")
     add_trust(sweep)
-    sweep.set_defaults(overrides=[], writes=True)
+    sweep.set_defaults(overrides=[])
 
 
 def _sweep(options: argparse.Namespace) -> int:
@@ -80,29 +77,29 @@ def _sweep(options: argparse.Namespace) -> int:
 
     from rigidmd.errors import OutputError
     from rigidmd.studies.sweep.axes import parse_axes
-    from rigidmd.studies.sweep.sweeping import Wanted, opened, opened_again
+    from rigidmd.studies.sweep.sweeping import SweepRequest, open_existing_sweep, open_sweep
 
     _check(options)
     folder = Path(options.output) if options.output else None
     with ExitStack() as stack:
         if options.point is not None:
-            return _one_point(options)
+            return _run_point(options)
         if options.collect and not options.sets and options.replicas is None:
             if folder is None:
                 raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
-            return _collect(opened_again(folder, stack))
+            return _collect(open_existing_sweep(folder, stack))
         axes = parse_axes(options.sets)
-        wanted = Wanted(Path(options.scene), axes, folder, options.replicas, options.trust, options.force)
-        sweep = opened(wanted, stack)
+        request = SweepRequest(Path(options.scene), axes, folder, options.replicas, options.trust, options.force)
+        sweep = open_sweep(request, stack)
         if options.collect:
             return _collect(sweep)
         if options.to is not None:
-            return _to_slurm(options, sweep)
+            return _write_slurm_script(options, sweep)
         return _run(options, sweep)
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Raise OutputError for options that do not go together."""
+    """Raise OutputError for options that cannot be combined."""
     from rigidmd.errors import OutputError
 
     if options.to is not None and options.walltime is None:
@@ -111,42 +108,35 @@ def _check(options: argparse.Namespace) -> None:
         raise OutputError("--point needs -o, the folder of the sweep")
     alone = [name for name in ("to", "collect", "point", "scheduler") if getattr(options, name) not in (None, False)]
     if len(alone) > 1:
-        raise OutputError(f"--{alone[0]} and --{alone[1]} do not go together")
+        raise OutputError(f"--{alone[0]} and --{alone[1]} cannot be combined")
     if options.point is not None and (options.sets or options.replicas or options.force):
-        raise OutputError("--point runs what the folder says; leave out --set, --replicas and --force")
+        raise OutputError("--point uses the settings in the folder; leave out --set, --replicas and --force")
     if options.collect and options.force:
-        raise OutputError("--collect writes of what is there; leave out --force, which removes it")
+        raise OutputError("--collect only reads existing results; leave out --force, which removes them")
 
 
-def _run(options: argparse.Namespace, sweep: "Opened") -> int:
-    """Run what has not finished, and tell what came out."""
+def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
+    """Run what has not finished, and print the results."""
     from rigidmd.io.progress import progress_of
-    from rigidmd.studies.sweep.running import run_points
-    from rigidmd.studies.sweep.sweeping import collected, runner_of, shares
+    from rigidmd.studies.sweep.running import SweepOutcome, run_points
+    from rigidmd.studies.sweep.sweeping import collect, jobs_and_threads, runner_of
 
     folder, manifest = sweep.folder, sweep.manifest
-    jobs, threads = shares(sweep.left, options.jobs, options.threads, sweep.is_body)
+    jobs, threads = jobs_and_threads(sweep.left, options.jobs, options.threads, sweep.is_body)
     if options.scheduler not in (None, "local"):
         threads = options.threads or 1  # a thread of a worker of dask for each point
     count = len(manifest.points)
     print(f"{manifest.name}: {count} points in {folder}, {count - sweep.left} of them finished before", flush=True)
     if sweep.left:
         runner = runner_of(folder, options.scheduler, jobs, threads)
-        if options.scheduler is None:
-            at_a_time = f"{jobs} at a time, " if jobs > 1 else "one at a time, "
-            print(f"  {at_a_time}{threads} thread{'s' if threads > 1 else ''} each", flush=True)
-        else:
-            print(
-                f"  on the cluster {options.scheduler}, {threads} thread{'s' if threads > 1 else ''} each", flush=True
-            )
+        at_a_time = f"{jobs} at a time" if jobs > 1 else "one at a time"
+        where = at_a_time if options.scheduler is None else f"on the cluster {options.scheduler}"
+        print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
         with progress_of(sweep.left, "points", True) as bar:
-            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).hear)
+            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).receive)
     else:
-        from rigidmd.studies.sweep.running import Outcome
-
-        outcome = Outcome(skipped=[point.folder for point in manifest.points])
-    _told(*collected(folder, manifest), manifest)
-    again = shlex.join(["rigidmd", *sys.argv[1:]]).replace(" --force", "")
+        outcome = SweepOutcome(skipped=[point.folder for point in manifest.points])
+    _print_results(*collect(folder, manifest), manifest)
     print(
         f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {len(outcome.skipped)} skipped, "
         f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
@@ -155,7 +145,8 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
         if point.folder in outcome.failed:
             print(f"  failed: {point.folder}: {visible(point.message or '')}")
     if outcome.failed or outcome.left:
-        print(f"  the same command goes on with what is left, and repeats what failed: {again}")
+        again = command_line().replace(" --force", "")
+        print(f"  the same command continues with what is left, and repeats what failed: {again}")
     if outcome.signal is not None:
         return BY_SIGNAL + outcome.signal
     if outcome.out_of_time:
@@ -164,39 +155,38 @@ def _run(options: argparse.Namespace, sweep: "Opened") -> int:
 
 
 class _Listener:
-    """Shows what points say: shares as progress, warnings once each, failures at once."""
+    """Shows messages of points: fractions as progress, warnings once each, failures at once."""
 
     def __init__(self, bar: "Bar"):
         self._bar = bar
-        self._shares: dict[str, float] = {}
-        self._told: set[str] = set()
+        self._fractions: dict[str, float] = {}
+        self._shown: set[str] = set()
 
-    def hear(self, name: str, kind: str, value: Any) -> None:
-        """A message of a point."""
+    def receive(self, name: str, kind: str, value: Any) -> None:
+        """Show a message of the point `name`."""
         from tqdm import tqdm
 
-        if kind in ("share", "ended", "died"):
-            before, begins = self._shares.get(name, 0.0), kind == "share" and name not in self._shares
-            ended = kind != "share"
+        if kind in ("fraction", "ended", "died"):
+            before, begins = self._fractions.get(name, 0.0), kind == "fraction" and name not in self._fractions
+            ended = kind != "fraction"
             now = value if not ended else (1.0 if kind == "ended" and value["state"] == "finished" else before)
-            if begins and not self._shares:
+            if begins and not self._fractions:
                 self._bar.unpause()  # this is when the first steps begin
-            self._shares[name] = max(before, now)
+            self._fractions[name] = max(before, now)
             # what a resumed point had before
             (self._bar.skip if begins else self._bar.update)(max(0.0, now - before))
             why = value if kind == "died" else value["message"] if ended else None
             if why:
                 tqdm.write(f"  {name}: {visible(why)}", file=sys.stderr)
-        elif kind == "said" and value.startswith("compiling") and value not in self._told:
-            self._told.add(value)
+        elif kind == "announced" and value.startswith("compiling") and value not in self._shown:
+            self._shown.add(value)
             tqdm.write(f"  {name}: {value} ...", file=sys.stderr)
-        elif kind == "warned" and value not in self._told:
-            self._told.add(value)
+        elif kind == "warned" and value not in self._shown:
+            self._shown.add(value)
             tqdm.write(f"rigidmd: warning: {name}: {visible(value)}", file=sys.stderr)
 
 
-def _told(table: "Table", files: list[Path], manifest: "Manifest") -> None:
-    """Print a table, and where it is."""
+def _print_results(table: "Table", files: list[Path], manifest: "Manifest") -> None:
     from rigidmd.studies.sweep.table import table_text
 
     if files:
@@ -209,18 +199,18 @@ def _told(table: "Table", files: list[Path], manifest: "Manifest") -> None:
         print(f"  `rigidmd analyse {shlex.quote(str(table.folder))}` measures all of them")
 
 
-def _collect(sweep: "Opened") -> int:
+def _collect(sweep: "OpenSweep") -> int:
     """`--collect`."""
-    from rigidmd.studies.sweep.sweeping import collected
+    from rigidmd.studies.sweep.sweeping import collect
 
     count = len(sweep.manifest.points)
     left = sum(point.state != "finished" for point in sweep.manifest.points)
     print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - left} of them finished")
-    _told(*collected(sweep.folder, sweep.manifest), sweep.manifest)
+    _print_results(*collect(sweep.folder, sweep.manifest), sweep.manifest)
     return FAILED if left else 0
 
 
-def _to_slurm(options: argparse.Namespace, sweep: "Opened") -> int:
+def _write_slurm_script(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     """`--to slurm`."""
     from rigidmd.studies.sweep.slurm import write_script
 
@@ -236,22 +226,22 @@ def _to_slurm(options: argparse.Namespace, sweep: "Opened") -> int:
     return 0
 
 
-def _one_point(options: argparse.Namespace) -> int:
-    """`--point`: the one that a scheduler started."""
+def _run_point(options: argparse.Namespace) -> int:
+    """`--point`: the point that a scheduler started."""
     if options.threads is not None:
         import os
 
         os.environ["NUMBA_NUM_THREADS"] = str(options.threads)  # before Numba is imported
     from rigidmd.studies.sweep.sweeping import run_point
 
-    def tell(kind: str, value: Any) -> None:
+    def send(kind: str, value: Any) -> None:
         if kind == "warned":
             warn(value)
-        elif kind == "said":
-            say(value)
+        elif kind == "announced":
+            announce(value)
 
     name, ended = run_point(
-        Path(options.output), options.point, Path(options.scene), options.walltime, options.trust, tell
+        Path(options.output), options.point, Path(options.scene), options.walltime, options.trust, send
     )
     print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")
     if ended["message"]:

@@ -1,4 +1,4 @@
-"""Cases, which are named ways to try to break the engine; scenes made in code, their runs and outcomes."""
+"""The registry of stability cases, and the scenes that they make in code and run."""
 
 import time as clock
 from collections.abc import Callable
@@ -15,10 +15,9 @@ from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Simulation
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.studies.stability.outcomes import Finding, Outcome
+from rigidmd.studies.stability.outcomes import CaseResult, Outcome
 
-#: Integrator families: the common one with both rotors, a symplectic Nystrom scheme, a composition with the split
-#: rotor.
+#: Integrator families: velocity Verlet with both rotors, a symplectic Nystrom scheme, compositions with split rotors.
 FAMILIES = {
     "velocity_verlet": {"integrator": "velocity_verlet", "rotor": "split"},
     "velocity_verlet, exact rotor": {"integrator": "velocity_verlet", "rotor": "exact"},
@@ -37,41 +36,40 @@ TEXTBOOK = {
 }
 
 
-#: A case adds trials to its finding; quick : fewer settings and integrators.
-Attempt = Callable[[Finding, bool], None]
+#: run(result, quick) adds runs and step limits to the result; quick : fewer settings and integrators.
+CaseFunction = Callable[[CaseResult, bool], None]
 
 
-class Case(NamedTuple):
-    """A named way to try to break the engine. group : its number in the list of what the battery must hold."""
+class StabilityCase(NamedTuple):
+    """A named way to try to break the engine. group : number of its kind of difficulty, from 1 to 14."""
 
     name: str
     group: int
     sentence: str
-    attempt: Attempt
+    run: CaseFunction
     titles: tuple[str, str, str]  # of x and of the error; unit of steps
 
 
-CASES: dict[str, Case] = {}
+CASES: dict[str, StabilityCase] = {}
 
 
-def case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[Attempt], Attempt]:
+def register_case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
     """Register a function as a case under its own name, with the first line of its docstring."""
 
-    def enter(attempt: Attempt) -> Attempt:
-        sentence = (attempt.__doc__ or "").strip().splitlines()[0].rstrip(".")
-        CASES[attempt.__name__] = Case(attempt.__name__, group, sentence, attempt, (x, error, step))
-        return attempt
+    def register(run: CaseFunction) -> CaseFunction:
+        sentence = (run.__doc__ or "").strip().splitlines()[0].rstrip(".")
+        CASES[run.__name__] = StabilityCase(run.__name__, group, sentence, run, (x, error, step))
+        return run
 
-    return enter
+    return register
 
 
 def families(quick: bool) -> tuple[str, ...]:
-    """The families for every case."""
     return QUICK if quick else tuple(FAMILIES)
 
 
-def attempt(run: Callable[[], Outcome]) -> Outcome:
-    """The outcome of a run. An error of rigidmd becomes its message, any other a crash."""
+def outcome_of(run: Callable[[], Outcome]) -> Outcome:
+    """The outcome of a run. An error of rigidmd becomes its message, any other exception a crash."""
     began = clock.perf_counter()
     try:
         with np.errstate(all="ignore"):
@@ -94,39 +92,35 @@ def body_scene(data: dict, step: float, duration: float, family: str, samples: i
 def run_body(
     data: dict, step: float, duration: float, family: str, error: Callable[[Results], float], samples: int = 50
 ) -> Outcome:
-    """A run of a body for a duration (s), with error(results) against the known answer."""
+    """The outcome of a run of a body for a duration (s); error(results) compares with the known answer."""
 
     def run() -> Outcome:
         results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
         wrong = list(results.summary["largest_relative_error"].values())
-        orthogonality = results.summary["largest_orthogonality_error"]
-        told = max([*wrong, orthogonality or 0.0], default=0.0)
-        return Outcome(float(error(results)), float(told))
+        reported_error = max([*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0)
+        return Outcome(float(error(results)), float(reported_error))
 
-    return attempt(run)
+    return outcome_of(run)
 
 
-def away_from(rotation: np.ndarray) -> Callable[[Results], float]:
-    """The largest entry of |Q - Q_known| at the end, Q of the body's own axes."""
+def rotation_error(rotation: np.ndarray) -> Callable[[Results], float]:
+    """A function that computes the largest entry of |Q - Q_known| at the end."""
     return lambda results: np.abs([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)] - rotation).max()
 
 
-def invariants(results: Results) -> float:
-    """Largest relative error of L along the lab's axes, of |L| and of Q's orthogonality; not of the energy."""
+def invariants_error(results: Results) -> float:
+    """Largest relative error of L along the lab's axes and of |L|, and orthogonality error; not of the energy."""
     wrong = results.summary["largest_relative_error"]
     return max([results.summary["largest_orthogonality_error"], *(e for name, e in wrong.items() if name != "energy")])
 
 
-def everything_kept(results: Results) -> float:
-    """Largest relative error of all conserved quantities and of Q's orthogonality."""
-    return max(invariants(results), results.summary["largest_relative_error"].get("energy", 0.0))
+def conserved_error(results: Results) -> float:
+    """Largest relative error of all conserved quantities, and orthogonality error."""
+    return max(invariants_error(results), results.summary["largest_relative_error"].get("energy", 0.0))
 
 
-def solved(inertia, omega, span: float) -> np.ndarray:
-    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion, independent of the flows.
-
-    Its error is about 1e-13 per radian.
-    """
+def free_rotation(inertia, omega, span: float) -> np.ndarray:
+    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion; its error is 1e-13 per radian."""
     i1, i2, i3 = (float(i) for i in inertia)
     k1, k2, k3 = (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
 
@@ -142,9 +136,6 @@ def solved(inertia, omega, span: float) -> np.ndarray:
     return from_quaternion(found.y[3:, -1])
 
 
-# Molecules
-
-
 def molecules_scene(
     molecules: list[dict],
     box: dict,
@@ -154,9 +145,9 @@ def molecules_scene(
     temperature: float | None = 298.0,
     thermostat: dict | None = None,
     forces: dict | None = None,
-    looks: int = 25,
+    samples: int = 25,
 ) -> dict:
-    """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `looks` times, no files."""
+    """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `samples` times, no files."""
     stage = {"duration_ps": step * steps / 1000, "timestep_fs": float(step)} | FAMILIES[family]
     if thermostat is not None:
         stage |= {"ensemble": "nvt"} | thermostat
@@ -166,12 +157,11 @@ def molecules_scene(
         "forces": forces or {},
         "start": {} if temperature is None else {"temperature_K": float(temperature)},
         "stages": [stage],
-        "output": {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // looks) / 1000)},
+        "output": {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // samples) / 1000)},
     }
 
 
-def molecular(data: dict) -> MolecularScene:
-    """The scene of tables of molecules. Raises SceneError."""
+def molecular_scene(data: dict) -> MolecularScene:
     scene = Scene.from_dict(data)
     if not isinstance(scene, MolecularScene):
         raise TypeError(f"{scene.name} is a single body")
@@ -179,8 +169,7 @@ def molecular(data: dict) -> MolecularScene:
 
 
 def simulate(data: dict, state: State | None = None) -> Results:
-    """Run a scene of molecules, from a given state if there is one."""
-    simulation = Simulation(molecular(data))
+    simulation = Simulation(molecular_scene(data))
     if state is not None:
         simulation.start_from(state)
     return simulation.run()
@@ -194,29 +183,26 @@ def energy_error(results: Results, scale: float = 0.0) -> float:
 
 
 def run_molecules(
-    data: dict,
-    state: State | None = None,
-    error: Callable[[Results], float] | None = None,
-    scale: float = 0.0,
+    data: dict, state: State | None = None, error: Callable[[Results], float] | None = None, scale: float = 0.0
 ) -> Outcome:
-    """A run of molecules; its error is that of the energy unless `error` computes another."""
+    """The outcome of a run of molecules; its error is the energy error unless error(results) computes another."""
 
     def run() -> Outcome:
         results = simulate(data, state)
-        told = energy_error(results, scale)
-        return Outcome(told if error is None else float(error(results)), told)
+        reported_error = energy_error(results, scale)
+        return Outcome(reported_error if error is None else float(error(results)), reported_error)
 
-    return attempt(run)
+    return outcome_of(run)
 
 
-def only_built(data: dict) -> Outcome:
-    """A scene that must be refused before it runs; otherwise it counts as run without a right answer."""
+def run_invalid(data: dict) -> Outcome:
+    """The outcome of a scene that must be refused before it runs; one that runs has no right answer."""
 
     def run() -> Outcome:
         Simulation(Scene.from_dict(data)).run()
         return Outcome(nan, 0.0)
 
-    return attempt(run)
+    return outcome_of(run)
 
 
 WATERS, WATER_FORCES = 64, {"cutoff_A": 6.0}
@@ -226,30 +212,23 @@ WATERS, WATER_FORCES = 64, {"cutoff_A": 6.0}
 def liquid(model: str, temperature: float, step: float, steps: int) -> State:
     """A state of water after these steps (fs) at a temperature (K), from a lattice."""
     with np.errstate(all="ignore"):
-        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_heat(temperature, step))).state
+        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_thermostat(temperature, step))).state
 
 
-def weak_heat(temperature: float, step: float) -> dict:
+def weak_thermostat(temperature: float, step: float) -> dict:
     """A thermostat with a time of 20 steps (fs)."""
     return {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
 
 
 def water_scene(model: str, *settings, **more) -> dict:
-    """`molecules_scene` of a box of water; of TIP4P of 1983 sites are given, because it is not a shipped model."""
+    """`molecules_scene` of a box of water. TIP4P of 1983 is not a shipped model."""
     kind = {"name": "tip4p", "sites": TIP4P} if model == "tip4p" else {"model": model}
     box = {"density_g_cm3": 0.997}
     return molecules_scene([kind | {"count": WATERS}], box, *settings, forces=WATER_FORCES, **more)
 
 
 TIP4P = [
-    {
-        "name": "OW",
-        "element": "O",
-        "mass_u": 15.9994,
-        "position_A": [0.0, 0.0, 0.0],
-        "sigma_A": 3.154,
-        "epsilon_K": 78.0,
-    },
+    {"name": "OW", "element": "O", "mass_u": 15.9994, "position_A": [0.0] * 3, "sigma_A": 3.154, "epsilon_K": 78.0},
     {"name": "HW1", "element": "H", "mass_u": 1.008, "position_A": [0.756950, 0.585882, 0.0], "charge_e": 0.52},
     {"name": "HW2", "element": "H", "mass_u": 1.008, "position_A": [-0.756950, 0.585882, 0.0], "charge_e": 0.52},
     {"name": "MW", "mass_u": 0.0, "position_A": [0.0, 0.15, 0.0], "charge_e": -1.04},

@@ -1,16 +1,24 @@
-"""Invalid bodies and numbers."""
+"""Stability cases: invalid molecules, and NaN and infinity in scenes."""
 
 import copy
 from collections.abc import Iterator
 from math import inf, nan
 
+from rigidmd.studies.stability.cases import (
+    EXACT,
+    SPLIT,
+    body_scene,
+    molecules_scene,
+    register_case,
+    run_invalid,
+    run_molecules,
+)
 from rigidmd.studies.stability.collisions import BOX, FORCES, bent, from_file, pair_of
-from rigidmd.studies.stability.outcomes import REFUSED, Finding
-from rigidmd.studies.stability.runs import EXACT, SPLIT, body_scene, case, molecules_scene, only_built, run_molecules
+from rigidmd.studies.stability.outcomes import REFUSED, CaseResult
 
 
-@case(13, error="energy error over kinetic energy", step="fs")
-def strange_molecules(find: Finding, quick: bool) -> None:
+@register_case(13, error="energy error over kinetic energy", step="fs")
+def strange_molecules(result: CaseResult, quick: bool) -> None:
     """Coinciding sites, a straight molecule along a diagonal, no mass, negative mass, mass at one point only."""
 
     def scene(change) -> dict:
@@ -18,30 +26,30 @@ def strange_molecules(find: Finding, quick: bool) -> None:
         change(kind["sites"])
         return molecules_scene([kind], BOX, 1.0, 50, SPLIT, 300.0, None, FORCES)
 
-    def place(sites, k, position):
+    def set_position(sites, k, position):
         sites[k]["position_A"] = position
 
-    def masses(sites, *values):
+    def set_masses(sites, *values):
         for site, value in zip(sites, values, strict=True):
             site["mass_u"] = value
 
-    unfit = {
-        "two coinciding sites": lambda s: place(s, 1, [-1.0, 0.0, 0.0]),
-        "two sites 1e-9 Å apart": lambda s: place(s, 1, [-1.0, 1e-9, 0.0]),
-        "all sites coinciding": lambda s: [place(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
-        "no mass": lambda s: masses(s, 0.0, 0.0, 0.0),
-        "negative mass": lambda s: masses(s, 12.0, -1.0, 12.0),
-        "all mass in one site": lambda s: masses(s, 0.0, 12.0, 0.0),
-        "massless site off a line of masses": lambda s: masses(s, 12.0, 0.0, 12.0),
+    changes = {
+        "two coinciding sites": lambda s: set_position(s, 1, [-1.0, 0.0, 0.0]),
+        "two sites at 1e-9 Å": lambda s: set_position(s, 1, [-1.0, 1e-9, 0.0]),
+        "all sites coinciding": lambda s: [set_position(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
+        "no mass": lambda s: set_masses(s, 0.0, 0.0, 0.0),
+        "negative mass": lambda s: set_masses(s, 12.0, -1.0, 12.0),
+        "all mass in one site": lambda s: set_masses(s, 0.0, 12.0, 0.0),
+        "massless site off a line of masses": lambda s: set_masses(s, 12.0, 0.0, 12.0),
     }
-    for words, change in unfit.items():
-        find.add(words, only_built(scene(change)), 0.0, SPLIT, expected=(REFUSED,))
+    for setting, change in changes.items():
+        result.add(setting, run_invalid(scene(change)), 0.0, SPLIT, expected=(REFUSED,))
 
     def slanted(sites):
         for site, k in zip(sites, (-1.0, 0.0, 1.0), strict=True):
             site["position_A"] = [0.1 + 0.3 * k, 0.2 + 0.7 * k, 0.3 - 0.9 * k]
 
-    find.add("a straight molecule given in space", run_molecules(scene(slanted)), 0.05, SPLIT)
+    result.add("a straight molecule given in space", run_molecules(scene(slanted)), 0.05, SPLIT)
 
 
 def numbers(data, keys: tuple = ()) -> Iterator[tuple]:
@@ -63,8 +71,8 @@ def replaced(data: dict, keys: tuple, value) -> dict:
     return other
 
 
-@case(13)
-def no_numbers(find: Finding, quick: bool) -> None:
+@register_case(13)
+def no_numbers(result: CaseResult, quick: bool) -> None:
     """NaN and infinity in place of every number of a scene of molecules, of a body, and in structures."""
     heat = {"temperature_K": 300.0, "thermostat_time_ps": 0.1}
     molecules = molecules_scene([bent() | {"count": 8}], BOX, 1.0, 10, SPLIT, 300.0, heat, FORCES | {"skin_A": 1.0})
@@ -85,15 +93,19 @@ def no_numbers(find: Finding, quick: bool) -> None:
         1.0,
         EXACT,
     )
-    for words, data in (("molecules", molecules), ("body", body)):
+    for setting, data in (("molecules", molecules), ("body", body)):
         for keys in numbers(data):
             for value in (nan, inf, -inf):
-                outcome = only_built(replaced(data, keys, value))
-                find.add(f"{words}, {'.'.join(map(str, keys))} = {value}", outcome, 0.0, words, expected=(REFUSED,))
+                outcome = run_invalid(replaced(data, keys, value))
+                result.add(
+                    f"{setting}, {'.'.join(map(str, keys))} = {value}", outcome, 0.0, setting, expected=(REFUSED,)
+                )
     species, state = pair_of(5.0, 0.1)
     file = molecules_scene(species, BOX, 1.0, 10, SPLIT, None, None, FORCES)
     for part in ("position", "velocity", "rotation", "angular_momentum_body"):
         for value in (nan, inf):
             bad = state.copy()
             getattr(bad, part)[1] = value
-            find.add(f"structure, {part} = {value}", from_file(file, bad, True), 0.0, "structure", expected=(REFUSED,))
+            result.add(
+                f"structure, {part} = {value}", from_file(file, bad, True), 0.0, "structure", expected=(REFUSED,)
+            )

@@ -1,0 +1,114 @@
+"""`rigidmd accuracy`: errors of integrators against their run time; with --averages alone, the bias of averages."""
+
+import argparse
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+
+from rigidmd.commands.arguments import (
+    Commands,
+    add_command,
+    add_output_folder,
+    add_scene,
+    command_line,
+    progress_bar,
+    read_scene,
+)  # fmt: skip
+from rigidmd.commands.streams import announce
+
+
+def add(commands: Commands) -> None:
+    accuracy = add_command(
+        commands, "accuracy", _accuracy, "measure the error and the run time of integrators at several time steps",
+        "rigidmd accuracy heavy_top_3.toml --integrators velocity_verlet,srkn_6\n"
+        "  rigidmd accuracy heavy_top_3.toml --integrators rk4,rk4_quaternion,rk4_euler_angles\n"
+        "  rigidmd accuracy liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "
+        "--integrators baoab,velocity_verlet+nose_hoover",
+    )  # fmt: skip
+    add_scene(accuracy)
+    accuracy.add_argument(
+        "--integrators", metavar="A,B,...",
+        help="integrators (default: the scene's and those that suit it; for a body also general ODE solvers, "
+        "each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
+        "dop853_quaternion, dop853_euler_angles). If the scene sets run.formulation, rk4, dop853 and radau use it, "
+        "and rk4_matrix uses the matrix",
+    )  # fmt: skip
+    accuracy.add_argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body")
+    accuracy.add_argument("--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)")
+    accuracy.add_argument(
+        "--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"
+    )
+    accuracy.add_argument(
+        "--averages", type=float, metavar="PS", nargs="?", const=inf,
+        help="molecules only. With PS: also average temperatures, energy and pressure over that time with every step, "
+        "at constant energy. Without PS: only measure the bias of averages: sample the last stage under its thermostat "
+        "(nvt, npt) with every integrator at every step. --integrators then accepts names with a thermostat, "
+        "baoab+langevin (default: the method of the stage, baoab+langevin, velocity_verlet+velocity_rescaling, "
+        "velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest stable one",
+    )  # fmt: skip
+    accuracy.add_argument(
+        "--sample-ps", type=float, metavar="PS",
+        help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)",
+    )  # fmt: skip
+    add_output_folder(accuracy, "runs/NAME-accuracy")
+
+
+def _accuracy(options: argparse.Namespace) -> int:
+    from rigidmd.errors import SceneError
+    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.studies.accuracy.accuracy import measure_accuracy
+    from rigidmd.studies.accuracy.report import FILES, recommendations, table_text, write_accuracy
+
+    scene = read_scene(options)
+    folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
+    check_folder(folder, options.force, names=FILES)
+    integrators = options.integrators.split(",") if options.integrators else None
+    try:
+        timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
+    except ValueError:
+        raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
+    if options.averages == inf:
+        return _averages(options, scene, folder, integrators, timesteps)
+    if options.sample_ps is not None:
+        raise SceneError("--sample-ps", ["it needs --averages without a PS"])
+    with progress_bar() as bar:
+        progress = _progress(bar, "compiling and running the reference")
+        found = measure_accuracy(
+            scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
+        )
+    print(*recommendations(found), "", table_text(found), sep="\n")
+    make_folder(folder, options.force, FILES)
+    written = write_accuracy(folder, found, command_line())
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+def _averages(
+    options: argparse.Namespace, scene, folder: Path, methods: list[str] | None, timesteps: list[float] | None
+) -> int:
+    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
+    from rigidmd.studies.accuracy.averages_report import FILES, bias_conclusions, table_text, write_averages
+
+    check_folder(folder, options.force, names=FILES)
+    sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
+    with progress_bar() as bar:
+        progress = _progress(bar, "compiling, and running what comes before the last stage")
+        found = measure_averages(scene, methods, timesteps, sample, progress)
+    print(table_text(found), "", *bias_conclusions(found), sep="\n")
+    make_folder(folder, options.force, FILES)
+    written = write_averages(folder, found, command_line())
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+def _progress(bar, begins: str) -> Callable[[float], None]:
+    """A callback that moves a bar; at 0, when all arguments have been checked, it announces what begins."""
+
+    def progress(fraction: float) -> None:
+        if fraction == 0:
+            bar.clear()
+            announce(begins)
+        bar.update(fraction - bar.n)
+
+    return progress

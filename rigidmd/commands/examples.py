@@ -1,0 +1,30 @@
+"""`rigidmd examples`."""
+
+import argparse
+
+from rigidmd.commands.arguments import Commands, add_command
+
+
+def add(commands: Commands) -> None:
+    about = "list the scenes, notebooks and scripts that rigidmd ships"
+    add_command(commands, "examples", _examples, about, "rigidmd examples")
+
+
+def _examples(options: argparse.Namespace) -> int:
+    from rigidmd.scene.shipped import examples, notebooks, scripts
+
+    scenes = examples()
+    kinds = {
+        "molecules": [example for example in scenes if not example.is_body],
+        "one body": [example for example in scenes if example.is_body],
+        "notebooks": notebooks(),
+        "scripts, which extend it": scripts(),
+    }
+    width = max(len(example.name) for example in scenes)
+    for title, found in kinds.items():
+        print(f"{title}:")
+        for example in found:
+            print(f"  {example.name:<{width}}  {example.about}")
+        print()
+    print("`rigidmd new NAME` copies one into the working directory")
+    return 0

@@ -1,0 +1,25 @@
+"""`rigidmd help`."""
+
+import argparse
+
+from rigidmd.commands.arguments import Commands, add_command
+
+
+def add(commands: Commands) -> None:
+    about = "list the chapters of the documentation, or print one"
+    chapters = add_command(commands, "help", _help, about, "rigidmd help water | less")
+    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them")
+
+
+def _help(options: argparse.Namespace) -> int:
+    from rigidmd.scene.shipped import chapter_text, contents
+
+    if options.chapter is not None:
+        print(chapter_text(options.chapter))
+        return 0
+    found = contents()
+    width = max(map(len, found))
+    print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
+    for name, about in found.items():
+        print(f"  {name:<{width}}  {about}")
+    return 0

@@ -1,0 +1,88 @@
+"""`rigidmd models`."""
+
+import argparse
+import shlex
+from pathlib import Path
+
+from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.streams import warn
+
+
+def add(commands: Commands) -> None:
+    models = add_command(
+        commands, "models", _models,
+        "list the molecular models that rigidmd ships, show or draw one, or write a custom model",
+        "rigidmd models tip4p2005 --draw -o water.svg\n"
+        "  rigidmd models --from dye.xyz --parameters table.toml -o dye.toml",
+    )  # fmt: skip
+    models.add_argument("model", nargs="?", metavar="NAME", help="model to show, or the .toml file of a custom model")
+    models.add_argument("--draw", action="store_true", help="draw it to NAME.png")
+    models.add_argument(
+        "--from", dest="geometry", metavar="FILE",
+        help="write a custom model: a structure file with one molecule, of any format that a scene reads",
+    )  # fmt: skip
+    models.add_argument(
+        "--parameters", metavar="TABLE",
+        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element",
+    )  # fmt: skip
+    models.add_argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model")
+    models.add_argument(
+        "-o", "--output", metavar="FILE",
+        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)",
+    )  # fmt: skip
+    models.add_argument("--force", action="store_true", help="replace that file")
+
+
+def _models(options: argparse.Namespace) -> int:
+    from rigidmd.errors import MoleculeError
+    from rigidmd.scene.models import available_models, load_model, read_molecule
+    from rigidmd.view.molecule_text import models_table, molecule_text
+
+    if options.geometry is not None:
+        return _write_model(options)
+    if options.parameters is not None or options.custom_name is not None:
+        given = "--parameters" if options.parameters is not None else "--name"
+        raise MoleculeError("models", [f"{given} belongs to --from FILE, which writes a custom model"])
+    draws = options.draw or options.output is not None
+    if options.model is None:
+        if draws:
+            raise MoleculeError("models", ["--draw and -o need the NAME of a model"])
+        print(models_table([load_model(name) for name in available_models()]))
+        print("\n`rigidmd models NAME` shows one in full; --draw draws it")
+        return 0
+    found = read_molecule(Path(options.model)) if options.model.endswith(".toml") else load_model(options.model)
+    if not draws:
+        print(molecule_text(found))
+        return 0
+    from rigidmd.view.molecule_figure import draw_molecule
+
+    path = Path(options.output or f"{Path(options.model).stem}.png")
+    draw_molecule(path, found, options.force)
+    print(f"{found.name} is drawn in {path}")
+    return 0
+
+
+def _write_model(options: argparse.Namespace) -> int:
+    """`models --from`."""
+    from rigidmd.assemble.model_from_geometry import model_from_geometry
+    from rigidmd.errors import MoleculeError
+    from rigidmd.io.model_file import write_model
+    from rigidmd.io.write import check_target
+
+    if options.model is not None:
+        problem = f"--from writes a custom model: leave out {options.model}, or name the model by --name"
+        raise MoleculeError("models", [problem])
+    geometry, parameters = Path(options.geometry), Path(options.parameters) if options.parameters else None
+    path = Path(options.output or f"{geometry.stem}.toml")
+    if options.draw:
+        raise MoleculeError("models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"])
+    made = model_from_geometry(geometry, parameters, options.custom_name)
+    check_target(path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])])
+    write_model(path, made.file)
+    print(f"{path}: {made.molecule.name}, {made.molecule.description}; {made.file.source}")
+    for note in made.notes:
+        warn(note)
+    print("next:")
+    print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")
+    print(f'a scene uses it by a line of its [[molecules]]: file = "{path.name}"')
+    return 0

@@ -1,0 +1,43 @@
+"""`rigidmd new`."""
+
+import argparse
+import shlex
+from pathlib import Path
+
+from rigidmd.commands.arguments import Commands, add_command
+
+
+def add(commands: Commands) -> None:
+    about = "copy a shipped scene, notebook or script to start from"
+    new = add_command(commands, "new", _new, about, "rigidmd new water -o mine.toml")
+    new.add_argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them")
+    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
+    new.add_argument("--force", action="store_true", help="replace that file")
+
+
+def _new(options: argparse.Namespace) -> int:
+    from rigidmd.scene import Scene
+    from rigidmd.scene.shipped import copy_example, find_example, series_of
+
+    example = find_example(options.name)
+    path = Path(options.output or f"{example.name}{example.path.suffix}")
+    read = Scene.read(example.path).inputs.values() if example.kind == "scene" else ()
+    written = copy_example(example, path, options.force, read)
+    if example.name != options.name:
+        print(f"{options.name} is a series of scenes ({', '.join(series_of(options.name))}); this is {example.name}")
+    print(f"{path}: {example.about}")
+    if inputs := [str(file) for file in written[1:]]:
+        print(f"files that it reads, copied to the same folder: {', '.join(inputs)}")
+    print("next:")
+    quoted = shlex.quote(str(path))
+    if example.kind == "script":
+        print(f"  python {quoted}    runs it; `rigidmd help extending` explains it")
+        return 0
+    if example.kind == "notebook":
+        print("  open it in Jupyter, VS Code or any program for notebooks: pip install 'rigidmd[notebook]' jupyterlab")
+        print(f"  jupyter lab {quoted}")
+        return 0
+    print(f"  rigidmd check {quoted}    describes the run without running it")
+    print(f"  rigidmd run {quoted}      runs it; results go to {Path('runs') / path.stem}")
+    print("its comment describes what to look at; `rigidmd help manual` explains every table")
+    return 0

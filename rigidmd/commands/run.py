@@ -1,0 +1,83 @@
+"""`rigidmd run`; `resume` uses its options and its call."""
+
+import argparse
+import shlex
+from pathlib import Path
+
+from rigidmd.commands.arguments import (
+    BY_SIGNAL,
+    OUT_OF_TIME,
+    Commands,
+    add_command,
+    add_engine,
+    add_scene,
+    read_scene,
+    seconds,
+    time_ps,
+)  # fmt: skip
+from rigidmd.commands.streams import announce, warn
+
+
+def add(commands: Commands) -> None:
+    run = add_command(commands, "run", run_scene, "run a scene", "rigidmd run water.toml -o runs/water")
+    add_scene(run)
+    run.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
+    run.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+    run.add_argument(
+        "--resume", action="store_true",
+        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start",
+    )  # fmt: skip
+    add_engine(run)
+    add_duration(run)
+
+
+def add_duration(parser: argparse.ArgumentParser) -> None:
+    """Add --threads, --walltime and --until."""
+    parser.set_defaults(writes=True)
+    parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
+    parser.add_argument(
+        "--walltime", type=seconds, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with a checkpoint and exit code 75",
+    )  # fmt: skip
+    parser.add_argument(
+        "--until", type=time_ps, metavar="TIME",
+        help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
+    )  # fmt: skip
+
+
+def run_scene(options: argparse.Namespace) -> int:
+    """Run or resume a scene."""
+    from rigidmd.scene import BodyScene
+
+    scene = read_scene(options)
+    if options.threads is not None:
+        from rigidmd.errors import SceneError
+
+        if isinstance(scene, BodyScene):
+            raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
+        scene = read_scene(options, threads=options.threads)
+    if options.until is not None:
+        scene = scene.with_end(options.until)
+    folder = Path(options.output) if options.output else Path("runs") / scene.name
+    from rigidmd.io.folder import check_folder
+
+    if not options.resume:
+        check_folder(folder, options.force)  # before anything slow is imported
+    from rigidmd.run import Simulation
+
+    simulation = Simulation(
+        scene, folder, options.force, say=announce, warn=warn, resume=options.resume, walltime=options.walltime
+    )
+    print(simulation.introduction(), flush=True)
+    results = simulation.run(progress=True)
+    print(simulation.conclusion(results))
+    print(f"\n  files in {folder}: {', '.join(path.name for path in results.files)}")
+    quoted = shlex.quote(str(folder))
+    if results.interrupted:
+        print(f"  `rigidmd resume {quoted}` continues it")
+    else:
+        more = "report` the page alone" if isinstance(scene, BodyScene) else f"analyse {quoted}` measures it"
+        print(f"  `rigidmd view {quoted}` shows its film on a page, `rigidmd {more}")
+    if results.out_of_time:
+        return OUT_OF_TIME
+    return BY_SIGNAL + results.signal if results.signal else 0

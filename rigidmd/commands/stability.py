@@ -1,0 +1,40 @@
+"""`rigidmd stability`."""
+
+import argparse
+from pathlib import Path
+
+from rigidmd.commands.arguments import FAILED, Commands, add_command, add_output_folder, command_line, progress_bar
+
+
+def add(commands: Commands) -> None:
+    about = (
+        "try to break the engine: named cases, each compared with a known answer; exit code 1 if an error is undetected"
+    )
+    example = "rigidmd stability --quick --case near_linear --case water_steps"
+    stability = add_command(commands, "stability", _stability, about, example)
+    stability.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
+    stability.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
+    add_output_folder(stability, "runs/stability")
+    stability.set_defaults(scene="stability")
+
+
+def _stability(options: argparse.Namespace) -> int:
+    import platform
+
+    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.studies.stability.report import FILES, conclusions, has_failed, table_text, write_stability
+    from rigidmd.studies.stability.stability import run_cases, selected_cases
+
+    folder = Path(options.output) if options.output else Path("runs") / "stability"
+    check_folder(folder, options.force, names=FILES)
+    with progress_bar("{l_bar}{bar}| {desc} [{elapsed}]", len(selected_cases(options.case))) as bar:
+        results = []
+        for result in run_cases(options.case, options.quick, bar.set_description_str):
+            results.append(result)
+            bar.update()
+    print(table_text(results), "", *conclusions(results), sep="\n")
+    make_folder(folder, options.force, FILES)
+    machine = platform.processor() or platform.machine()
+    written = write_stability(folder, results, command_line(), machine)
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return FAILED if has_failed(results) else 0
