@@ -236,8 +236,8 @@ def broken(what: str) -> Atoms:
         ("nan cell", "it has an edge that is not a finite number"),
         ("empty", "there are none"),
         ("missing", r"molecule 2 \(atoms 4 to 5, by bonding distance\) has atoms O H, expected spce \(O H2\)"),
-        ("other", r"has atoms called S, which are in no molecule of the scene: spce \(O H2\)"),
-        ("bent", r"molecule 1 .* is no spce: an atom is .* Å from the rigid template"),
+        ("other", r"has atoms named S, which are in no molecule of the scene: spce \(O H2\)"),
+        ("bent", r"molecule 1 .* is not spce: an atom is .* Å from the rigid template"),
     ],
 )
 def test_atoms_that_cannot_be_used_are_told(what, said):
@@ -626,7 +626,7 @@ def test_a_damaged_one_is_told(traj, tmp_path):
     [
         ("shorter", "2 frames of"),
         ("changed", "its checksum is not that"),
-        ("noise", "it is no trajectory of ASE"),
+        ("noise", "not a trajectory of ASE"),
     ],
 )
 def test_one_that_changed_is_not_gone_on_with(fault, said, traj, tmp_path):

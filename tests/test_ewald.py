@@ -460,7 +460,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     }
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
-    assert any("turned, contents included" in note for note in system.notes)
+    assert any("rotated, contents included" in note for note in system.notes)
     inside = lambda n: (np.abs(n) <= (4, 2, 3)).all(axis=1)  # noqa: E731
     oracle = EwaldOracle([[1, 2, 3], [4, 9.5, 2.5]], [1, -1], [0, 1], cell, 0.4, 6.0, inside)
     found = observe(system, system.engine(), system.state).components
@@ -488,7 +488,7 @@ temperature_K = 100
 duration_ps = 0.004
 """)
     told = (
-        "its lattice is described by the cell with edges 36.0000, 36.0000, 35.4545 Å, angles 90, 119.5, 90°, "
+        "its lattice is given by the cell with edges 36.0000, 36.0000, 35.4545 Å, angles 90, 119.5, 90°, "
         "c' = c - a, in place of edges 36.0000, 36.0000, 36.0000 Å, angles 90, 59, 90°"
     )
     scene = str(tmp_path / "leaning.toml")

@@ -421,19 +421,19 @@ def test_what_is_frozen_is_left_alone():
 
 def test_check_tells_of_fields_and_of_what_is_left_out():
     text = describe(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
-    assert "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps; its work is booked" in text
+    assert "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps; its work is in the energy ledger" in text
     assert "gravity: (0, 0, -9.81) m/s²" in text
     assert (
         "walls 0: at z = 0 Å and z = 16 Å, on 60 sites: Lennard-Jones 9-3, sigma 2.5 Å, epsilon 1.5 kJ/mol, no" in text
     )
     assert "total momentum: conserved along x and y" in text
-    assert "  restraints: not asked for in [fields]" in text
+    assert "  restraints: not in [fields]" in text
     held = describe(small_scene({"spce": 4}, 20.0, fields={"restraints": [{"stiffness_kJ_mol_A2": 2.0}]}))
-    assert "restraints 0: 4 molecules held where they start, 2 kJ/mol/Å²" in held
+    assert "restraints 0: 4 molecules restrained to their starting positions, 2 kJ/mol/Å²" in held
     assert "total momentum: conserved nowhere" in held
-    assert "electric field, gravity, walls: not asked for in [fields]" in held
+    assert "electric field, gravity, walls: not in [fields]" in held
     pme = describe(slit({}, forces={"cutoff_A": 6.9, "electrostatics": "pme"}))
-    assert "total momentum: taken out along x and y every 1 ps" in pme
+    assert "total momentum: removed along x and y every 1 ps" in pme
     assert "fields.walls: pme sums over the images beyond the walls too" in pme
 
 
@@ -467,12 +467,12 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         ({"walls": [LJ | {"positions_A": [0.0, inf]}]}, {}, "a periodic box needs both walls"),
         ({"walls": [LJ, SOFT | {"positions_A": [21.0, 30.0]}]}, NO_BOX, "the walls across z leave no space between them"),
         ({"walls": [LJ | {"positions_A": [0.0, 22.0]}]}, {},
-         "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may stand out, "
+         "along z the box is 30 Å, and must be 33 Å at least: 22 Å between the walls, 2 Å by which sites may protrude, "
          "and the cutoff of 9 Å"),
         ({"walls": [LJ]}, {"box": {"lengths_A": 40.0, "angles_deg": [90.0, 80.0, 90.0]}}, "need a box with right angles"),
-        ({"walls": [LJ | {"positions_A": [0.0, 5.0]}]}, {}, "those across z leave no room for molecules to start"),
+        ({"walls": [LJ | {"positions_A": [0.0, 5.0]}]}, {}, "the walls across z leave no space for molecules"),
         ({"walls": [LJ]}, {"molecules": [{"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}]},
-         "bare has no site with Lennard-Jones parameters, and would pass the walls; acts_on = 'centres' holds it"),
+         "bare has no site with Lennard-Jones parameters, and would pass the walls; use acts_on = 'centres'"),
         ({"walls": [LJ]}, {"forces": {"tail_correction": True}}, "between walls leave it out"),
         ({"restraints": [{}]}, {}, "fields.restraints.0.stiffness_kJ_mol_A2: is missing"),
         ({"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]}, {}, "stiffness_kJ_mol_A2: is 0: it would do nothing"),
@@ -481,7 +481,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
          "fields.restraints.0.molecules: no spce has the number 2-9; they have 1 to 5"),
         ({"restraints": [HELD | {"species": "ice"}]}, {}, "fields.restraints.0.species: there is no 'ice'; there are spce"),
         ({"restraints": [HELD]}, {"molecules": [{"model": "spce", "count": 2}, {"model": "argon", "count": 2}]},
-         "fields.restraints.0.species is needed: there are spce, argon"),
+         "fields.restraints.0.species is required: there are spce, argon"),
         ({"restraints": [HELD | {"molecules": "1-2"}]}, {"molecules": [{"model": "spce", "count": 5, "frozen": [2]}]},
          "fields.restraints.0.molecules: frozen ones are among 1-2"),
         ({"restraints": [HELD]}, {"run": {"remove_momentum_interval_ps": 1.0}},

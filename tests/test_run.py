@@ -571,7 +571,7 @@ def test_when_total_momentum_is_taken_out():
     with pytest.raises(SceneError, match="total momentum is not conserved with frozen molecules"):
         small_scene({}, 25.0, molecules=frozen, run={"remove_momentum_interval_ps": 0.1})
     text = describe(argon(run={"remove_momentum_interval_ps": 0.2}))
-    assert "total momentum: taken out every 0.2 ps" in text
+    assert "total momentum: removed every 0.2 ps" in text
     assert "run.remove_momentum_interval_ps is false" in describe(argon(run={"remove_momentum_interval_ps": False}))
 
 

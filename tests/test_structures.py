@@ -238,16 +238,16 @@ ICE_IH_VOLUME = 7.82**2 * 7.36 * np.sqrt(3) / 2
 # file, model, scene's box, count, g/cm³, rms and largest distance from the template in Å, note; or a message
 REFERENCE = [
     ("structures/spc216.gro", "spce", None, 216, density(216, WATER, 18.6206**3), 0.0038, 0.0116, ""),
-    ("structures/spc216.gro", "tip4p2005", None, 216, 1.0008, 0.0492, 0.0675, "216 sites without mass that the file"),
+    ("structures/spc216.gro", "tip4p2005", None, 216, 1.0008, 0.0492, 0.0675, "216 sites without mass are missing in the file"),
     ("structures/tip4p.gro", "tip4p2005", None, 216, density(216, WATER, 18.6824**3), 0.0040, 0.0109, ""),
-    ("structures/tip4p.gro", "spce", None, 216, 0.9909, 0.0492, 0.0685, "216 sites without mass (MW) that no model"),
+    ("structures/tip4p.gro", "spce", None, 216, 0.9909, 0.0492, 0.0685, "216 sites without mass (MW) are in no model"),
     ("structures/openmm_spce_box.pdb", "spce", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
     ("structures/openmm_tip3p_box.pdb", "tip3p", None, 895, density(895, WATER, 30.0**3), 0.0004, 0.0013, ""),
     (
         "structures/genice_ice1h_tip4p_seed42.gro", "tip4p2005", None,
         192, density(192, WATER, 23.4685163 * 14.7071453 * 18.0730370), 0.0040, 0.0111, "",
     ),
-    ("structures/genice_ice1h_tip4p_seed42.gro", "spce", None, 192, 0.9208, 0.0488, 0.0682, "(MW) that no model has"),
+    ("structures/genice_ice1h_tip4p_seed42.gro", "spce", None, 192, 0.9208, 0.0488, 0.0682, "(MW) are in no model"),
     ("structures/chemfiles_water_297_frame1.pdb", "spce", None, 99, density(99, WATER, 15.0**3), 0.0490, 0.0608, ""),
     ("structures/chemfiles_water_297_frame1.pdb", "tip3p", None, 99, 0.8775, 0.0004, 0.0013, ""),
     ("structures/N2_alpha_nitrogen.cif", "nitrogen", None, 4, density(4, 28.0134, 5.644**3), 0.0171, 0.0171, ""),
@@ -258,9 +258,9 @@ REFERENCE = [
     ("structures/H2O_ice_Ih.cif", "tip4p2005", None, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
     # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
     ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
-    ("structures/H2O_ice_Ih.cif", "spce", inf, "is no spce: an atom is 0.173 Å from the rigid template"),
+    ("structures/H2O_ice_Ih.cif", "spce", inf, "is not spce: an atom is 0.173 Å from the rigid template"),
     ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
-    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 tell no element"),
+    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 are no elements"),
     (
         "awkward/two_water_gro_widebox.gro", "spce", None,
         2, density(2, WATER, 76.4092 * 79.1768 * 73.1922), 0.0041, 0.0063, "",
@@ -271,8 +271,8 @@ REFERENCE = [
     ("awkward/water_spc_99_chem.cssr", "spce", None, "its cell, a cube of 1 Å, stands for none"),
     ("awkward/water_spc_99_chem.cssr", "spce", 15.0, 99, density(99, WATER, 15.0**3), 0.0490, 0.0600, "cube of 1 Å"),
     ("awkward/triclinic-1.lmp", "spce", None, "holds no atoms"),
-    ("awkward/missing_atomname.gro", "spce", None, "has atoms called (no name)"),
-    ("awkward/missing_atomname.gro", "argon", None, "has atoms called (no name)"),
+    ("awkward/missing_atomname.gro", "spce", None, "has atoms named (no name)"),
+    ("awkward/missing_atomname.gro", "argon", None, "has atoms named (no name)"),
 ]  # fmt: skip
 
 
@@ -380,9 +380,9 @@ def test_order_of_atoms(order, split, ending, tmp_path):
         text = gro(atoms, box_of(truth.cell), digits=9, residues=ending == "gro")
     found = read(tmp_path, text, f"a.{ending.split()[0]}", species)
     same_molecules(found, truth, species, error)
-    assert any("9 sites without mass that the file lacks (tip4p2005): built" in note for note in found.notes)
+    assert any("9 sites without mass are missing in the file (tip4p2005): built" in note for note in found.notes)
     if order is oxygens_of_all_first and ending in ("gro", "pdb"):
-        assert any("told by bonding distance" in note for note in found.notes)
+        assert any("found by bonding distance" in note for note in found.notes)
 
 
 def test_names_begin_with_an_element_of_the_scene_if_they_can():
@@ -485,7 +485,7 @@ def test_the_deviation_of_sites_that_share_names_is_that_of_their_best_order(tmp
     truth = Truth([alike_by_name(SPECIES["benzene"], "elements")] * 2)
     atoms = [(n, e, k, x + ([0.5, 0, 0] if i == 11 else 0), v) for i, (n, e, k, x, v) in enumerate(truth.atoms())]
     text = gro(atoms[::-1], box_of(truth.cell), residue_names={0: "BNZ", 1: "BNZ"})
-    with pytest.raises(StructureError, match=r"molecule 2 .* is no benzene: an atom is 0\.[34]\d\d Å from the rigid"):
+    with pytest.raises(StructureError, match=r"molecule 2 .* is not benzene: an atom is 0\.[34]\d\d Å from the rigid"):
         read(tmp_path, text, "a.gro", truth.species[:1])
 
 
@@ -515,7 +515,7 @@ def test_turned_shifted_wrapped_and_shuffled_atoms_are_the_same_molecules(kinds,
     found = read(tmp_path, xyz(atoms, written), "a.xyz", species, periodic=not slant)
     truth.centre = truth.centre + shift
     same_molecules(found, truth, species, 1e-6)
-    assert any("was turned" in note for note in found.notes)
+    assert any("was rotated" in note for note in found.notes)
     if not slant:
         assert found.cell == pytest.approx(cell)
 
@@ -579,11 +579,11 @@ def test_a_cell_leans_by_half_an_edge_as_far_as_files_tell(angles, told):
 def test_what_was_made_of_a_cell_is_said(tmp_path):
     truth = Truth(["spce"] * 4, 5)
     text = xyz(wrapped(truth.atoms(), truth.cell), truth.cell * [[1], [1], [-1]])
-    assert any("left-handed: -c stands for c" in note for note in read(tmp_path, text, "a.xyz").notes)
+    assert any("left-handed: -c replaces c" in note for note in read(tmp_path, text, "a.xyz").notes)
     nearly = truth.cell.copy()
     nearly[2, 0] = 1e-5 * nearly[2, 2]
     told = read(tmp_path, xyz(wrapped(truth.atoms(), truth.cell), nearly), "b.xyz").notes
-    assert told == ("its angles of 90, 89.99943, 90° were taken for right ones",)
+    assert told == ("its angles of 90, 89.99943, 90° were set to right angles",)
 
 
 def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
@@ -591,13 +591,13 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
     box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
     system = build(small_scene({"argon": 4}, None, box=box))
     assert any(
-        "box: its lattice is described by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes
+        "box: its lattice is given by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes
     )
     write_state(tmp_path / "final.npz", system.saved(system.state))
     data = {"box": box, "structure": {"file": "final.npz"}, "molecules": [{"model": "argon"}],
             "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
     again = build(Scene.from_dict(data, tmp_path))
-    assert not any("box counts" in note for note in again.notes)
+    assert not any("box of the scene is used" in note for note in again.notes)
     assert any("the scene's box: its lattice is described by" in note and "c' = c - a" in note for note in again.notes)
 
 
@@ -632,7 +632,7 @@ def test_a_state_is_not_taken_for_one_of_another_model_of_that_name(tmp_path):
     saved = system.saved(system.state)
     points = system.state._replace(rotation=np.zeros((0, 3, 3)), angular_momentum_body=np.zeros((0, 3)))
     write_state(tmp_path / "points.npz", saved._replace(state=points, models=None))
-    with pytest.raises(StructureError, match="holds no rotations, but tip4p2005 can turn"):
+    with pytest.raises(StructureError, match="has no rotations, but tip4p2005 can rotate"):
         read_as("tip4p2005", "points.npz")
 
 
@@ -650,7 +650,7 @@ def test_molecules_of_a_slanted_cell_are_made_whole(tmp_path):
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
     leaning = read(tmp_path, text, "a.xyz")  # c lies on top of b: the same lattice by a cell that leans less
     assert leaning.cell == pytest.approx(np.array([[12.0, 0, 0], [-3.0, 11.0, 0], [-5.0, -4.0, 12.0]]))
-    assert any("its lattice is described by the cell with edges 12.0000, 11.4018, 13.6015" in n for n in leaning.notes)
+    assert any("its lattice is given by the cell with edges 12.0000, 11.4018, 13.6015" in n for n in leaning.notes)
     same_molecules(leaning, truth, [SPECIES["spce"]], 1e-6)
 
 
@@ -704,7 +704,7 @@ def test_a_mirror_image_is_another_molecule(tmp_path):
     truth = Truth(["chiral"] * 4, 7)
     mirrored = [(name, e, k, x * [-1, 1, 1], v) for name, e, k, x, v in truth.atoms()]
     with pytest.raises(
-        StructureError, match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is no halothane: an atom is"
+        StructureError, match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is not halothane: an atom is"
     ):
         read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
 
@@ -781,7 +781,7 @@ def test_velocities_of_some_atoms(tmp_path):
     text = lines(lambda line: "2SOL    HW1" in line)
     found = read(tmp_path, text, "b.gro", ["tip4p2005"])
     assert found.velocity is None
-    assert found.notes == ("1 of its atoms have no velocity (the first is atom 6): none is used",)
+    assert found.notes == ("1 of its atoms have no velocity (the first is atom 6): no velocity is used",)
     data = small_scene({"tip4p2005": 5}, None).model_dump(exclude={"start"}) | {
         "box": {},
         "structure": {"file": "b.gro", "velocities": True},
@@ -798,7 +798,7 @@ def test_velocities_in_a_column_without_units_are_not_used(tmp_path):
     text[2:] = [line + " 1 2 3" for line in text[2:]]
     found = read(tmp_path, "\n".join(text) + "\n", "a.xyz", ["argon"])
     assert found.velocity is None
-    assert found.notes == ("the column vel does not say its units and is not used (ASE writes momenta instead)",)
+    assert found.notes == ("the column vel has no units and is not used (ASE writes momenta instead)",)
 
 
 def frames_of(ending, truths):
@@ -900,7 +900,7 @@ def test_lammps_data(units, velocity_unit, molecule_ids, tmp_path):
         assert found.velocity == pytest.approx(truth.velocity[partner], rel=1e-5)
     else:
         assert found.velocity is None
-        assert any("does not say its units" in note for note in found.notes)
+        assert any("does not name its units" in note for note in found.notes)
 
 
 def repartitioned(truth, labels=("", ""), section="") -> str:
@@ -916,7 +916,7 @@ def test_lammps_atom_types_by_name(tmp_path):
     text = repartitioned(truth)
     with pytest.raises(
         StructureError,
-        match=r"atom types 1 \(9.9994 u\), 2 \(4.00794 u\) weigh .* \(1.008, 15.9994 u\): .*structure.atom_types",
+        match=r"atom types 1 \(9.9994 u\), 2 \(4.00794 u\) have masses .* \(1.008, 15.9994 u\): .*structure.atom_types",
     ):
         read(tmp_path, text, "a.data")
     ways = [
@@ -932,7 +932,7 @@ def test_lammps_atom_types_by_name(tmp_path):
     for file, atom_types, others in [(*way, [helium]) for way in ways] + [(begun, None, [])]:
         found = read(tmp_path, file, "a.data", ["spce", *others], atom_types=atom_types)
         same_molecules(found, truth, [SPECIES["spce"]], 1e-6)
-        assert any("masses of the scene count, not those of the file" in note for note in found.notes)
+        assert any("masses of the scene are used, not the masses in the file" in note for note in found.notes)
     found = read(tmp_path, text.replace("9.9994", "15.9994").replace("4.00794", "1.008"), "a.data")
     assert not any("masses" in note for note in found.notes)
     heavy = with_masses(SPECIES["spce"], {"O": 9.9994, "H": 4.00794})
@@ -981,9 +981,9 @@ def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
 @pytest.mark.parametrize(
     ("atom_types", "message"),
     [
-        ({"1": "O"}, r"structure.atom_types does not say what type 2 is"),
-        ({"1": "O", "2": "H", "7": "H", "OW": "O"}, r"structure.atom_types: there is no type 7, OW; there are 1, 2"),
-        ({"1": "O", "2": "hw1"}, r"structure.atom_types.2 = 'hw1' is no site or element .* there are OW, HW1, HW2, O, H; did you mean HW1\?"),
+        ({"1": "O"}, r"structure.atom_types has no name for type 2"),
+        ({"1": "O", "2": "H", "7": "H", "OW": "O"}, r"structure.atom_types: unknown type 7, OW; there are 1, 2"),
+        ({"1": "O", "2": "hw1"}, r"structure.atom_types.2 = 'hw1' is not a site or element .* there are OW, HW1, HW2, O, H; did you mean HW1\?"),
         ({"1": "H", "2": "O"}, r"molecule 1 .* has atoms H O2, expected spce \(O H2\)"),
     ],
 )  # fmt: skip
@@ -1167,7 +1167,7 @@ def test_the_scene_may_want_another_box_than_the_file(tmp_path):
     text = gro(wrapped(truth.atoms(), truth.cell), box_of(truth.cell), 9)
     found = read(tmp_path, text, "a.gro", cell=30 * np.eye(3))
     assert found.residual_max < 1e-6  # whole by the file's box, not the scene's
-    assert found.notes == ("the scene's box counts, not that of the file",)
+    assert found.notes == ("the box of the scene is used, not the box of the file",)
     assert np.diag(found.cell) == pytest.approx(30)
 
 
@@ -1245,7 +1245,7 @@ def test_lammps_data_as_people_write_it(case, name, tmp_path):
         (data_of(WATER_DATA) + "25 9 1\n", "line 3 promises 24 atoms, the section Atoms has 25"),
         (data_of(WATER_DATA, header="Atoms # bond\n\n"), "line 16: an atom of style 'bond' has 6 columns .*, found 7"),
         (data_of(WATER_DATA).replace("\n3 1 2 ", "\n3 x 2 "), r"line 17: expected an atom .id mol type q x y z., found '3 x 2"),
-        (data_of(WATER_DATA).replace("xlo xhi", "xlo"), "there is no line 'LOW HIGH xlo xhi'"),
+        (data_of(WATER_DATA).replace("xlo xhi", "xlo"), "a line 'LOW HIGH xlo xhi' is missing"),
     ],
 )  # fmt: skip
 def test_lammps_data_that_cannot_be_read_say_where(text, message, tmp_path):
@@ -1352,7 +1352,7 @@ def test_lammps_dumps_that_cannot_be_read_say_where(change, message, tmp_path):
 def test_velocities_of_a_dump_without_units_are_not_used(tmp_path):
     found = read(tmp_path, dump_of(WATER_DATA, "id element x y z vx vy vz"), "a.dump")
     assert found.velocity is None
-    assert found.notes == ("it does not say its units (dump_modify units yes): its velocities are not used",)
+    assert found.notes == ("it does not name its units (dump_modify units yes): its velocities are not used",)
 
 
 def wide_pdb(atoms, cell, serial, shift) -> str:
@@ -1626,7 +1626,7 @@ DAMAGED = {
     ),
     "columns.xyz": ("1\nProperties=species:S:1:pos:R:3:vel:R:3\nO 0 0 0\n", "line 3: expected 7 columns, species:S:1"),
     "decimals.xyz": ("1\n\nO 0,1 0,2 0,3\n", "line 3: expected an atom of an .xyz: name, x, y, z, found"),
-    "nameless.xyz": ('1\nLattice="9 0 0 0 9 0 0 0 9" Properties=pos:R:3\n0 0 0\n', "holds no atoms with mass"),
+    "nameless.xyz": ('1\nLattice="9 0 0 0 9 0 0 0 9" Properties=pos:R:3\n0 0 0\n', "has no atoms with mass"),
     "empty.cif": (" \n", "holds no atoms: it is empty"),
     "words.xyz": ("3\n\nO a b c\nH 0 0 0\nH 0 0 0\n", "line 3: expected an atom of an .xyz: .* found 'a b c'"),
     "cut.arc": (cut(arc(WATERS.atoms(), None), 9), r"promises 12 atoms, 8 are there"),
@@ -1667,7 +1667,7 @@ def test_coordinates_in_other_units(unit, angstrom, tmp_path):
 def test_species_that_the_scene_lacks(tmp_path):
     truth = Truth(["spce", "nitrogen", "spce", "argon"], 17)
     with pytest.raises(
-        StructureError, match=r"atoms called Ar, N, which are in no molecule of the scene: spce \(O H2\)"
+        StructureError, match=r"atoms named Ar, N, which are in no molecule of the scene: spce \(O H2\)"
     ):
         read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz")
     text = gro(truth.atoms(), box_of(truth.cell), residue_names={1: "N2", 3: "AR"})

@@ -1,4 +1,4 @@
-"""A system in words: how it would run, and what was left out."""
+"""The report of `rigidmd check`: how a system would run, and what is not compiled for it."""
 
 from math import inf
 from typing import NamedTuple
@@ -24,28 +24,27 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.user_code import name_of
 from rigidmd.scene.validation import not_none
 
-#: The arithmetic of forces, in words. Times: docs/benchmarks.md; the error is what tests/test_lanes.py allows.
+#: Precision of forces, for reports. Times: docs/benchmarks.md; the error is the tolerance of tests/test_lanes.py.
 PRECISIONS = {
-    "double": 'double precision (precision = "mixed" takes about half the time; its forces are good to 1e-5)',
-    "mixed": "mixed precision: single between sites, with forces good to 1e-5, and double for all else",
+    "double": 'double precision (precision = "mixed" takes about half the time; its forces have errors of 1e-5)',
+    "mixed": "mixed precision: single between sites, with errors of forces of 1e-5, else double",
 }
 
 
 def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
-    """How a scene would run, in words. Raises what building its system raises.
+    """How a scene would run. Raises the errors of `build` or `build_body`.
 
     user_code : see `build`
     """
     if isinstance(scene, MolecularScene):
-        return _molecules(build(scene, user_code))
-    text = _body(build_body(scene))
+        return _describe_molecules(build(scene, user_code))
+    text = _describe_body(build_body(scene))
     if scene.run.is_auto:
-        text += "\nthe integrator is chosen before the run, and its step, at most this one"
+        text += "\nthe integrator and its step, at most this step, are chosen before the run"
     return text
 
 
-def _body(system: BodySystem) -> str:
-    """Kind, inertia, terms, steps."""
+def _describe_body(system: BodySystem) -> str:
     scene, run = system.scene, system.scene.run
     pinned = "" if system.translates else ", pinned"
     moments = " ".join(f"{x:.9g}" for x in system.inertia)
@@ -64,12 +63,12 @@ def _body(system: BodySystem) -> str:
         pose = system.pose(0.0, system.state)
         angles = " ".join(f"{x:.6g}" for x in np.degrees(to_euler_angles(pose.rotation)))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
-        turn = f": a turn in {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
-        lines.append(f"  starts at phi theta psi = {angles} degrees, turning at {spin:.6g} rad/s{turn}")
+        period = f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
+        lines.append(f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}")
     body = system.body
     if isinstance(system.method, Scheme):
-        turned = system.engine().model_for(system.method)
-        body = turned if isinstance(turned, Body) else body
+        model = system.engine().model_for(system.method)
+        body = model if isinstance(model, Body) else body
     parts = [body.translation, body.rotor, body.frame, body.resistance]
     lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
@@ -82,8 +81,7 @@ def _body(system: BodySystem) -> str:
     return "\n".join(lines)
 
 
-def _molecules(system: System) -> str:
-    """Species, degrees of freedom, terms, stages, memory."""
+def _describe_molecules(system: System) -> str:
     scene, freedom = system.scene, system.last_freedom
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
@@ -92,7 +90,7 @@ def _molecules(system: System) -> str:
         lines.append(f"  {count} {m.name}: {m.description}, {freely}")
     charges = np.array([m.charge for m in system.species])[system.model.species]
     if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
-        lines.append(f"  net charge of all of them: {charges.sum():+.6g} e")
+        lines.append(f"  net charge: {charges.sum():+.6g} e")
     lines.append(
         f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
     )
@@ -105,9 +103,9 @@ def _molecules(system: System) -> str:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
-    words = describe_fields(scene, system.terms) | system.user_terms
+    descriptions = describe_fields(scene, system.terms) | system.user_terms
     for name, term in system.terms.items():
-        lines.append(f"  {name.replace('_', ' ')}: {words.get(name) or _term(system, name, term)}")
+        lines.append(f"  {name.replace('_', ' ')}: {descriptions.get(name) or _describe_term(system, name, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if system.thermostat is not None:
@@ -120,15 +118,15 @@ def _molecules(system: System) -> str:
     kept = [axis for axis, keeps in zip("xyz", system.model.keeps_momentum, strict=True) if keeps]
     if (interval := system.removes_momentum_every) is not None:
         part = "" if len(kept) == 3 else f" along {' and '.join(kept)}"
-        lines.append(f"  total momentum: taken out{part} every {interval:g} ps")
+        lines.append(f"  total momentum: removed{part} every {interval:g} ps")
     if (system.external or system.user_terms) and len(kept) < 3:
         lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
     lines.append("left out:")
     lines += [f"  {reason}" for reason in system.left_out]
     lines.append("\nstages:")
     for k, stage in enumerate(scene.stages):
-        how, law = describe_stage(stage)
-        lines += [f"  {k}: {how}", f"     {law}"]
+        steps, sampled = describe_stage(stage)
+        lines += [f"  {k}: {steps}", f"     {sampled}"]
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
     if not scene.engine.is_external:
         threads = usable_threads(scene.threads)
@@ -136,7 +134,7 @@ def _molecules(system: System) -> str:
     return "\n".join(lines)
 
 
-def _term(system: System, name: str, term: NamedTuple) -> str:
+def _describe_term(system: System, name: str, term: NamedTuple) -> str:
     if not isinstance(term, PairForces):
         return type(term).__name__
     reach = f"cutoff {system.cutoff:g} Å" if system.cutoff < inf else "no cutoff"

@@ -1,4 +1,4 @@
-"""Which atoms form which molecule: by residues, or else by bonding distance. Rigid templates are fitted to them."""
+"""Assigns the atoms of a file to molecules, by residues or else by bonding distance, and fits rigid templates."""
 
 from collections import Counter, deque
 from collections.abc import Hashable, Iterable
@@ -13,21 +13,22 @@ from rigidmd.io.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 
-#: Atoms are bonded up to this multiple of the template's longest bond between such atoms. Hydrogen bonds of water are
-#: at least 1.6 times its bonds.
+#: Atoms are bonded up to this multiple of the template's longest bond between atoms of the same labels. Hydrogen bonds
+#: of water are at least 1.6 times as long as its bonds.
 BOND_REACH = 1.25
 #: Partial assignments tried before the search for an order of atoms gives up.
 MOST_TRIES = 20_000
-MOST_DISTANCES = 1_000_000  # computed at a time
-#: u; engines without massless sites give them a mass below this.
+MOST_DISTANCES = 1_000_000  # computed at once
+#: u; programs without massless sites give them a mass below this.
 NO_MASS = 0.1
-#: Molecules that fit in no order, and the multiple of the tolerance to which their best order is sought for messages.
-MOST_NEAREST, NEAREST = 5, 3
-MOST_LISTED = 6  # atoms of a molecule that a message lists
+#: For the messages on the first molecules that do not fit, the best order of atoms is searched up to this multiple of
+#: the tolerance.
+MOST_SEARCHED, SEARCH_TOLERANCE = 5, 3
+MOST_LISTED = 6  # atoms of a molecule in a message
 
 
 class TemplateFit(NamedTuple):
-    """Rigid templates fitted to m molecules of s massive sites."""
+    """Rigid templates fitted to m molecules of s sites with mass."""
 
     centre: np.ndarray  # (m, 3) Å
     rotation: np.ndarray  # (m, 3, 3)
@@ -39,7 +40,7 @@ class MatchedMolecules(NamedTuple):
     """The molecules of a file, in the order of the file."""
 
     species: np.ndarray  # (n,)
-    atoms: list[np.ndarray]  # atoms of each molecule, in the order of its massive sites
+    atoms: list[np.ndarray]  # atoms of each molecule, in the order of its sites with mass
     centre: np.ndarray  # (n, 3) Å
     rotation: np.ndarray  # (n, 3, 3)
     deviation: np.ndarray  # (n,) Å
@@ -50,16 +51,16 @@ class MatchedMolecules(NamedTuple):
 
 
 def massive_sites(molecule: Molecule) -> np.ndarray:
-    """The sites of a molecule that have mass, and so are atoms."""
+    """Indices of the sites of a molecule that have mass, and so are atoms."""
     return np.flatnonzero(molecule.masses > 0)
 
 
 def match(
     atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float
 ) -> MatchedMolecules | list[str]:
-    """The molecules that the atoms form, or every reason why they form none.
+    """The molecules that the atoms form, or error messages.
 
-    cell: lattice (3, 3) across whose faces molecules may be split, or None. tolerance: see Scene.structure.
+    cell : lattice (3, 3) across whose faces molecules may be split, or None. tolerance : see Scene.structure
     """
     kinds = _kinds(atoms, species)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
@@ -71,43 +72,44 @@ def match(
     by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
     if isinstance(by_bonds, MatchedMolecules):
         if by_residue:
-            by_bonds.notes.append("its residues are no molecules of the scene; they were told by bonding distance")
+            by_bonds.notes.append(
+                "its residues are not the molecules of the scene, which were found by bonding distance"
+            )
         return by_bonds
     if by_residue and len(runs) > 1:
         return by_residue
     known = {"X"}.union(*map(_labels, species))
-    strange = sorted({name for name, kind in zip(atoms.names, kinds, strict=True) if kind not in known})
-    if strange:
-        called = ", ".join(name or "(no name)" for name in strange[:5]) + (", ..." if len(strange) > 5 else "")
+    if unknown := sorted({name for name, kind in zip(atoms.names, kinds, strict=True) if kind not in known}):
+        names = ", ".join(name or "(no name)" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
         wanted = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
-        return [f"has atoms called {called}, which are in no molecule of the scene: {wanted}"]
+        return [f"has atoms named {names}, which are in no molecule of the scene: {wanted}"]
     return by_bonds
 
 
 def refit(
     position: np.ndarray, matched: MatchedMolecules, species: list[Molecule], cell: np.ndarray | None
 ) -> MatchedMolecules:
-    """The same molecules where their atoms are now, position (a, 3), whatever their deviation."""
+    """The same molecules fitted to new positions (a, 3) of their atoms, for any deviation."""
     centre, rotation = np.zeros_like(matched.centre), np.zeros_like(matched.rotation)
     deviation, square = np.zeros_like(matched.deviation), np.zeros_like(matched.square)
     for k in np.unique(matched.species):
-        own = np.flatnonzero(matched.species == k)
-        points = _make_whole(position[np.array([matched.atoms[m] for m in own])], cell)
-        centre[own], rotation[own], deviation[own], square[own] = _fit(points, species[k])
+        members = np.flatnonzero(matched.species == k)
+        points = _make_whole(position[np.array([matched.atoms[m] for m in members])], cell)
+        centre[members], rotation[members], deviation[members], square[members] = _fit(points, species[k])
     return matched._replace(centre=centre, rotation=rotation, deviation=deviation, square=square)
 
 
 def _labels(molecule: Molecule) -> list[str]:
-    """Label of each site: its element, or else its name. Atoms of one label are interchangeable."""
+    """Label of each site: its element, else its name. Atoms with the same label are interchangeable."""
     return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]
 
 
 def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The label of every atom: its element, or a site's name; X for massless ones. With "?" it is a guess.
+    """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a guess.
 
-    An element in the file is accepted. A name counts if it is that of a site or begins with an element of the scene. If
-    the file gives masses, the name of a site or element precedes the mass, and the mass precedes the beginning of any
-    other name.
+    An element in the file is accepted. A name counts if it is the name of a site or begins with an element of the
+    scene. If the file has masses, names of sites and elements have priority over the mass, and the mass over the
+    beginning of any other name.
     """
     by_name, by_mass = {}, []
     for molecule in species:
@@ -118,7 +120,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     vocabulary = frozenset(label for _, label in by_mass)
     open_names = {name for name, labels in by_name.items() if len(labels) > 1}
     by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
-    own_names = set(by_name) - vocabulary
+    site_names = set(by_name) - vocabulary
     points = {name: _labels(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
     shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
     virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
@@ -126,7 +128,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
     def isotope(element: str) -> str:
-        """Isotopes of hydrogen that the scene lacks count as the one that it has: light water from a file of heavy."""
+        """The isotope of hydrogen in the scene, for others in the file: light water from a file of heavy water."""
         return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
 
     def kind(name: str, element: str, mass: float, residue: tuple) -> str:
@@ -135,14 +137,14 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
         if mass > 0:
             if name == "X" or isotope(name) in vocabulary:
                 return isotope(name)
-            if name in own_names:
+            if name in site_names:
                 return by_name[name]
             nearest, label = min(by_mass, key=lambda entry: abs(entry[0] - mass))
             if abs(nearest - mass) <= SAME_MASS * mass:
                 return label
             if (guess := isotope(element_of(name, vocabulary))) in vocabulary:
                 return guess
-        if name in own_names and (not element or element == "X"):
+        if name in site_names and (not element or element == "X"):
             return by_name[name]
         if name == virtual:
             return "X"
@@ -169,7 +171,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
-    """Groups of atoms connected by bonds as long as those of the templates, in file order, without massless ones.
+    """Groups of atoms with mass, in file order, that are connected by bonds as long as the bonds of the templates.
 
     The bonds of a template are the edges of its minimum spanning tree.
     """
@@ -187,21 +189,23 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
         for i, j, length in zip(tree.row, tree.col, tree.data, strict=True):
             one, other = number[i], number[j]
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
-    chosen = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
-    number = np.array([numbers[kinds[i]] for i in chosen], int)
-    i, j, distance = pairs_within(atoms.position[chosen], cell, reach.max())
+    with_mass = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
+    number = np.array([numbers[kinds[i]] for i in with_mass], int)
+    i, j, distance = pairs_within(atoms.position[with_mass], cell, reach.max())
     i, j = np.array([i, j])[:, distance <= reach[number[i], number[j]]]
-    shape = (len(chosen), len(chosen))
+    shape = (len(with_mass), len(with_mass))
     count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
     runs = [[] for _ in range(count)]
-    for atom, component in zip(chosen, label, strict=True):
+    for atom, component in zip(with_mass, label, strict=True):
         runs[component].append(atom)
     return sorted(runs)
 
 
 class _Candidate(NamedTuple):
+    """A species that a group of atoms may be."""
+
     species: int
-    order: list[int]  # positions in the run, in the order of the massive sites
+    order: list[int]  # atoms of the group, in the order of the sites with mass
     allowed: list[np.ndarray]  # (s, s) whether a site may be each atom of this order: by names, then by elements
     nameless: bool
 
@@ -209,7 +213,7 @@ class _Candidate(NamedTuple):
 def _match_groups(
     atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
 ) -> MatchedMolecules | list[str]:
-    """Each run of atoms as one molecule. Runs of one composition are fitted together. how: words for messages."""
+    """Each run of atoms as one molecule. Runs of one composition are fitted together. how : text for messages."""
     alike = {}
     for number, run in enumerate(runs):
         residue = atoms.residue[run[0]]
@@ -222,8 +226,8 @@ def _match_groups(
     )  # fmt: skip
     faults = {}
     for (residue, names, run_kinds), members in alike.items():
-        called = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
-        eligible = called or list(range(len(species)))
+        named = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
+        eligible = named or list(range(len(species)))
         candidates = [c for k in eligible if (c := _candidate(names, run_kinds, species[k], k))]
         if not candidates:
             has = _formula(kind.rstrip("?") for kind in run_kinds)
@@ -234,7 +238,7 @@ def _match_groups(
         if any(c.nameless for c in candidates) and not faults:
             listed = ", ".join(name or "(no name)" for name in names)
             by_shape = species[found.species[members[0]]].name
-            found.notes.append(f"atoms called {listed} tell no element: {by_shape} by shape")
+            found.notes.append(f"the names of atoms {listed} are no elements: assigned to {by_shape} by shape")
     if faults:
         return [f"{_describe_group(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
@@ -259,40 +263,40 @@ def _composition(molecule: Molecule) -> str:
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
-    """A run as a molecule of this species, or None.
+    """A run of atoms as a molecule of this species, or None.
 
-    Atoms are first assigned by the names that occur as often among the atoms as among the sites, and by element among
-    the rest. Names that occur several times leave the order of their atoms to the geometry.
+    Atoms are assigned by names that occur as often among the atoms as among the sites, and by element among the rest.
+    The order of atoms with the same name follows from the geometry.
     """
     sites = massive_sites(molecule)
     labels = _labels(molecule)
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
-        # as in the files of a run, whatever names sites share
+        # as in the files of a run, also if several sites have the same name
         return _Candidate(k, sites.tolist(), [np.eye(len(sites), dtype=bool), _same(labels[s] for s in sites)], False)
-    places = [i for i, kind in enumerate(kinds) if kind != "X"]
-    if len(places) > len(sites):
+    indices = [i for i, kind in enumerate(kinds) if kind != "X"]
+    if len(indices) > len(sites):
         massless = {name for name, mass in zip(molecule.site_names, molecule.masses, strict=True) if mass == 0}
-        places = [i for i in places if not (kinds[i].endswith("?") and names[i] in massless)]
-    if len(places) != len(sites):
+        indices = [i for i in indices if not (kinds[i].endswith("?") and names[i] in massless)]
+    if len(indices) != len(sites):
         return None
-    if len(places) > 1 and all(kinds[i].endswith("?") for i in places):
-        return _Candidate(k, places, [np.ones((len(sites), len(sites)), bool)], nameless=True)
-    there = [(names[i], kinds[i]) for i in places]
-    if Counter(kind for _, kind in there) != Counter(label for _, label in wanted):
+    if len(indices) > 1 and all(kinds[i].endswith("?") for i in indices):
+        return _Candidate(k, indices, [np.ones((len(sites), len(sites)), bool)], nameless=True)
+    present = [(names[i], kinds[i]) for i in indices]
+    if Counter(kind for _, kind in present) != Counter(label for _, label in wanted):
         return None
-    count, count_wanted = Counter(there), Counter(wanted)
+    count, count_wanted = Counter(present), Counter(wanted)
     shared = {atom for atom in count if count[atom] == count_wanted[atom]}
-    group, group_wanted = ([key if key in shared else key[1] for key in keys] for keys in (there, wanted))
+    group, group_wanted = ([key if key in shared else key[1] for key in keys] for keys in (present, wanted))
     queues: dict[Any, deque[int]] = {key: deque() for key in group_wanted}
-    for place, key in zip(places, group, strict=True):
-        queues[key].append(place)
+    for index, key in zip(indices, group, strict=True):
+        queues[key].append(index)
     order = [queues[key].popleft() for key in group_wanted]
     return _Candidate(k, order, [_same(group_wanted), _same(label for _, label in wanted)], nameless=False)
 
 
 def _same(keys: Iterable[Hashable]) -> np.ndarray:
-    """Which of n keys are the same (n, n)."""
+    """Mask (n, n) of equal keys."""
     numbers: dict[Hashable, int] = {}
     number = np.array([numbers.setdefault(key, len(numbers)) for key in keys])
     return number[:, None] == number
@@ -308,19 +312,19 @@ def _fit_group(
         fits.append((order, _fit_in_any_order(atoms.position, order, species[c.species], cell, c.allowed, tolerance)))
     for row, m in enumerate(members):
         limits = [tolerance * species[c.species].radius for c in candidates]
-        good = [k for k, (_, fit) in enumerate(fits) if len(fits[k][0][row]) == 1 or fit.deviation[row] <= limits[k]]
-        if len(good) == 1:
-            order, fit = fits[good[0]]
-            found.species[m] = candidates[good[0]].species
+        fitting = [k for k, (_, fit) in enumerate(fits) if len(fits[k][0][row]) == 1 or fit.deviation[row] <= limits[k]]
+        if len(fitting) == 1:
+            order, fit = fits[fitting[0]]
+            found.species[m] = candidates[fitting[0]].species
             found.atoms[m] = order[row]
             found.centre[m], found.rotation[m] = fit.centre[row], fit.rotation[row]
             found.deviation[m], found.square[m] = fit.deviation[row], fit.square[row]
-        elif good:
-            names = " or ".join(species[candidates[k].species].name for k in good)
+        elif fitting:
+            names = " or ".join(species[candidates[k].species].name for k in fitting)
             faults[m] = f"may be {names}: give them residue_names in the scene"
         else:
             off = [fit.deviation[row] for _, fit in fits]
-            if len(faults) < MOST_NEAREST:  # of the best order
+            if len(faults) < MOST_SEARCHED:  # of the best order
                 points = [_make_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
                 tried = zip(points, candidates, limits, off, strict=True)
                 off = [
@@ -328,8 +332,8 @@ def _fit_group(
                 ]
             k = int(np.argmin(np.array(off) / limits))
             faults[m] = (
-                f"is no {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, more "
-                f"than {limits[k]:.3f} Å (structure.tolerance)"
+                f"is not {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, "
+                f"more than {limits[k]:.3f} Å (structure.tolerance)"
             )
 
 
@@ -338,43 +342,42 @@ def _fit_in_any_order(
 ) -> TemplateFit:
     """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits.
 
-    allowed: see _Candidate; each is tried where those before it give no fit
+    allowed : see _Candidate; each is tried where the ones before it give no fit
     """
     limit = tolerance * molecule.radius
     points = _make_whole(position[order], cell)
     fit = _fit(points, molecule)
-    for way in allowed:
+    for mask in allowed:
         bad = np.flatnonzero(fit.deviation > limit)
-        if len(bad) and way.sum() > len(way):
-            bad = bad[_distances_agree(points[bad], molecule, way, limit)]
+        if len(bad) and mask.sum() > len(mask):
+            bad = bad[_distances_agree(points[bad], molecule, mask, limit)]
             while len(bad):
-                better = _search_order(points[bad[0]], molecule, way, limit)
+                better = _search_order(points[bad[0]], molecule, mask, limit)
                 if better is None:
                     bad = bad[1:]
                     continue
-                refit = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
-                mended = refit.deviation <= limit
-                for old, new in zip(fit, refit, strict=True):
-                    old[bad[mended]] = new[mended]
-                order[bad[mended]] = order[bad[mended]][:, better]
-                mended[0] = True  # even if rounding puts it just above the limit
-                bad = bad[~mended]
+                new_fit = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
+                fits = new_fit.deviation <= limit
+                for old, new in zip(fit, new_fit, strict=True):
+                    old[bad[fits]] = new[fits]
+                order[bad[fits]] = order[bad[fits]][:, better]
+                fits[0] = True  # even if rounding puts it just above the limit
+                bad = bad[~fits]
     return fit
 
 
 def _least_deviation(
     points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float
 ) -> float:
-    """The deviation of the atoms (s, 3) of a molecule in the best order that is found, for messages."""
-    order = _search_order(points, molecule, allowed, NEAREST * limit, MOST_TRIES // 10)
+    """The deviation of the atoms (s, 3) of a molecule in the best order found, for messages."""
+    order = _search_order(points, molecule, allowed, SEARCH_TOLERANCE * limit, MOST_TRIES // 10)
     return deviation if order is None else min(deviation, float(_fit(points[None, order], molecule).deviation[0]))
 
 
 def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
-    """Which molecules (m, s, 3) have the distances of the template, without regard to which atoms they are between.
+    """Which molecules (m, s, 3) have the same sorted distances between two kinds of atoms as the template.
 
-    In a molecule that fits, every distance is that of the template to twice the limit; so are then those between two
-    kinds of atoms in order of their length.
+    In a molecule that fits, every distance agrees with the template within twice the limit, and so do sorted ones.
     """
     template = molecule.positions_body[massive_sites(molecule)]
     i, j = np.triu_indices(len(template), 1)
@@ -391,7 +394,7 @@ def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray
 
 
 def _make_whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
-    """Molecules (m, s, 3) with every atom at its image nearest to the first atom."""
+    """Molecules (m, s, 3) with every atom at the image nearest to the first atom."""
     if cell is None or points.shape[1] == 1:
         return points
     from ase.geometry import find_mic
@@ -417,7 +420,7 @@ def _search_order(
     """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
 
     A depth-first search assigns atoms to sites one by one so that all distances agree: first closely, then up to twice
-    the limit, beyond which no fit within the limit exists.
+    the limit, which every fit within the limit satisfies.
     """
     template = molecule.positions_body[massive_sites(molecule)]
     wanted = np.linalg.norm(template[:, None] - template, axis=2)

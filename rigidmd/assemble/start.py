@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.fields import _range_of_centres
+from rigidmd.assemble.fields import range_of_centres
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.assemble.structure import Configuration, read_structure, with_reduced_cell
 from rigidmd.core.state import State
@@ -23,16 +23,16 @@ from rigidmd.units import GRAM_PER_CM3
 
 
 def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
-    """Positions and orientations from the structure file, or else on a lattice. Raises SceneError, StructureError."""
+    """Positions and orientations from the structure file, or on a lattice. Raises SceneError, StructureError."""
     if scene.structure is not None:
-        start, held = scene.structure, scene.embedded_files.get("structure.file")
-        path = scene.path(start.file) if held is None else Path(start.file)
+        start, content = scene.structure, scene.embedded_files.get("structure.file")
+        path = scene.path(start.file) if content is None else Path(start.file)
         if scene.box.cell is not None and (fault := cell_fault(scene.box.cell)):
             raise SceneError(scene.source, [f"box: {fault}"])
         try:
             found = read_structure(
                 path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat,
-                start.atom_types, None if scene.topology is None else scene.path(scene.topology), held,
+                start.atom_types, None if scene.topology is None else scene.path(scene.topology), content,
             )  # fmt: skip
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
@@ -40,16 +40,16 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
         for k, entry in enumerate(scene.molecules):
             present = int((found.species == k).sum())
             if entry.count is not None and entry.count != present:
-                faults.append(f"holds {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
+                faults.append(f"has {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
         if scene.structure.velocities and found.velocity is None:
-            told = "".join(f"; {note}" for note in found.notes if "velocit" in note)
-            faults.append(f"holds no velocities for all atoms{told}. Leave out structure.velocities = true")
+            why = "".join(f"; {note}" for note in found.notes if "velocit" in note)
+            faults.append(f"has no velocities of all atoms{why}. Leave out structure.velocities = true")
         if faults:
             raise StructureError(scene.structure_source, faults)
         return found
     counts = [not_none(entry.count) for entry in scene.molecules]
-    of_sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
-    check_memory_of_molecules(scene.source, sum(counts), of_sites)
+    sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
+    check_memory_of_molecules(scene.source, sum(counts), sites)
     mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
     cell = scene.box.cell
     if cell is None:
@@ -61,33 +61,32 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
     found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
         position=start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),
-        velocity=None, angular_momentum_body=None, cell=cell if scene.box.periodic else None, residual_rms=0.0,
-        residual_max=0.0,
+        velocity=None, angular_momentum_body=None, cell=cell if scene.box.periodic else None,
     )  # fmt: skip
-    return with_reduced_cell(found, "its", may_turn=False)
+    return with_reduced_cell(found, "its", may_rotate=False)
 
 
-def residue_numbers(arrangement: Configuration) -> np.ndarray:
-    """Residue numbers (n,) of the file, or else 1, 2, ... within each species."""
-    if arrangement.number is not None:
-        return arrangement.number
-    found = np.zeros(len(arrangement.species), np.int32)
-    for k in np.unique(arrangement.species):
-        own = arrangement.species == k
-        found[own] = np.arange(1, own.sum() + 1)
+def residue_numbers(configuration: Configuration) -> np.ndarray:
+    """Residue numbers (n,) of the file, else 1, 2, ... within each species."""
+    if configuration.number is not None:
+        return configuration.number
+    found = np.zeros(len(configuration.species), np.int32)
+    for k in np.unique(configuration.species):
+        members = configuration.species == k
+        found[members] = np.arange(1, members.sum() + 1)
     return found
 
 
-def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: Configuration) -> list[str]:
+def set_momenta(scene: MolecularScene, model: Model, state: State, start: Configuration) -> list[str]:
     """Set the momenta of a state, in place: from the structure file, or drawn at a temperature. Returns notes."""
     if scene.structure is not None and scene.structure.velocities:
-        state.velocity[:] = arrangement.velocity
-        state.angular_momentum_body[:] = not_none(arrangement.angular_momentum_body)[: len(state.angular_momentum_body)]
-        held = ~mobile(model)
-        state.velocity[held] = 0.0
-        state.angular_momentum_body[held[: len(state.rotation)]] = 0.0
+        state.velocity[:] = start.velocity
+        state.angular_momentum_body[:] = not_none(start.angular_momentum_body)[: len(state.angular_momentum_body)]
+        frozen = ~mobile(model)
+        state.velocity[frozen] = 0.0
+        state.angular_momentum_body[frozen[: len(state.rotation)]] = 0.0
         removed = remove_momentum(model, state.velocity)
-        return ["the total momentum of the file's velocities was taken out"] if removed else []
+        return ["the total momentum of the velocities in the file was removed"] if removed else []
     temperature = not_none(scene.start.temperature_K)
     draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
     return []
@@ -96,23 +95,20 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, arrangement: 
 def start_lattice(
     scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """n points (n, 3) on a lattice in a box with edges (3,), between its walls and far enough from them.
-
-    Raises SceneError.
-    """
+    """n points (n, 3) on a lattice in a box with edges (3,), at a distance from the walls. Raises SceneError."""
     low, high, faults = np.zeros(3), edges.copy(), []
     for axis, name in enumerate(AXES):
-        own = [walls for walls in scene.fields.walls if walls.direction == axis]
-        if not own:
+        across = [walls for walls in scene.fields.walls if walls.direction == axis]
+        if not across:
             continue
-        ends = [_range_of_centres(walls, species) for walls in own]
+        ends = [range_of_centres(walls, species) for walls in across]
         low[axis], high[axis] = max(end[0] for end in ends), min(end[1] for end in ends)
         if low[axis] == -inf:
             low[axis] = high[axis] - edges[axis]
         elif high[axis] == inf:
             high[axis] = low[axis] + edges[axis]
         if not low[axis] < high[axis]:
-            faults.append(f"fields.walls: those across {name} leave no room for molecules to start between them")
+            faults.append(f"fields.walls: the walls across {name} leave no space for molecules between them")
     if faults:
         raise SceneError(scene.source, faults)
     return low + lattice(n, high - low, rng)

@@ -1,4 +1,4 @@
-"""A start from a structure file: atoms become the scene's molecules, in the scene's box."""
+"""The starting configuration from a structure file: atoms become molecules of the scene, in its box."""
 
 from math import prod
 from pathlib import Path
@@ -28,12 +28,12 @@ from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
 
-MOST_NAMED = 5  # molecules that a message names; of more it gives the number
+MOST_NAMED = 5  # molecules named in a message; further ones are counted
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
-SAME_BOX = 1e-4  # relative difference between boxes of file and scene that printing explains
+SAME_BOX = 1e-4  # relative difference between the boxes of file and scene that rounding in files explains
 #: Masses, moments and numbers of sites of one model agree to this fraction.
 SAME_MODEL = 1e-6
-#: Units (Å) in which coordinates are sometimes given by mistake.
+#: Units (Å) in which coordinates are sometimes given in error.
 OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
 CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
 
@@ -47,22 +47,22 @@ class Configuration(NamedTuple):
     velocity: np.ndarray | None  # (n, 3) Å/ps
     angular_momentum_body: np.ndarray | None  # (n, 3) u Å²/ps
     cell: np.ndarray | None  # (3, 3), rows a along x, b in xy, c; Å
-    residual_rms: float  # Å, distances of atoms from their templates
-    residual_max: float  # Å
+    residual_rms: float = 0.0  # Å, distances of atoms from their templates
+    residual_max: float = 0.0  # Å
     number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
     notes: tuple[str, ...] = ()  # how the file was interpreted
-    basis: np.ndarray = SAME_BASIS  # (3, 3) integers: edges of the cell in terms of the described cell
+    basis: np.ndarray = SAME_BASIS  # (3, 3) integers: edges of the cell in terms of the given cell
 
 
 def read_structure(
     path: Path, species: list[Molecule], wanted: np.ndarray | None, periodic: bool, tolerance: float,
     frame: int | None = None, repeat: tuple[int, int, int] = (1, 1, 1), atom_types: dict[str, str] | None = None,
-    topology: Path | None = None, held: bytes | None = None,
+    topology: Path | None = None, content: bytes | None = None,
 ) -> Configuration:  # fmt: skip
     """The molecules of a structure file. Raises StructureError.
 
-    wanted: cell (3, 3) that the scene asks for, or None to take the file's. tolerance, frame, repeat, atom_types,
-    topology: see Scene.structure. held: the content, where there is no file.
+    wanted : cell (3, 3) of the scene, or None to use the cell of the file. tolerance, frame, repeat, atom_types,
+    topology : see Scene.structure. content : of a file that is not on disk, see `Scene.embedded_files`
     """
     if path.suffix == ".npz":
         if needless := [f"structure.{key}" for key, value in (("frame", frame), ("atom_types", atom_types)) if value]:
@@ -71,14 +71,14 @@ def read_structure(
         if periodic and wanted is None:
             _check_box(path, found.cell, [])
     else:
-        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology, held)
+        found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology, content)
     notes = list(found.notes)
     if not periodic:
         cell = None
     elif wanted is not None:
         cell = wanted
         if found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
-            notes.append("the scene's box counts, not that of the file")
+            notes.append("the box of the scene is used, not the box of the file")
     else:
         cell = found.cell
     if cell is not None and (fault := cell_fault(cell)):
@@ -86,33 +86,33 @@ def read_structure(
     found = found._replace(cell=cell, notes=tuple(notes))
     if repeat != (1, 1, 1):
         count = prod(repeat) * np.bincount(found.species, minlength=len(species)).astype(object)
-        of_sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
-        check_memory_of_molecules(str(path), sum(count), of_sites)
+        sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
+        check_memory_of_molecules(str(path), sum(count), sites)
         found = _repeated(found, repeat)
-    return with_reduced_cell(found, "its" if wanted is None else "the scene's box: its", may_turn=wanted is None)
+    return with_reduced_cell(found, "its" if wanted is None else "the scene's box: its", may_rotate=wanted is None)
 
 
-def with_reduced_cell(found: Configuration, whose: str, may_turn: bool) -> Configuration:
-    """The same crystal or liquid in a cell with small tilts; rotated, if that allows a longer cutoff.
+def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Configuration:
+    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff.
 
     whose : owner of the lattice, for the note
     """
     if found.cell is None:
         return found
-    cell, turn = least_skewed_cell(found.cell) if may_turn else (reduced(found.cell), np.eye(3))
+    cell, rotation = least_skewed_cell(found.cell) if may_rotate else (reduced(found.cell), np.eye(3))
     if np.array_equal(cell, found.cell):
         return found
-    basis = basis_of(cell @ turn, found.cell)
-    told = (
-        f"{whose} lattice is described by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
+    basis = basis_of(cell @ rotation, found.cell)
+    note = (
+        f"{whose} lattice is given by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
         f"in place of {edges_in_words(found.cell)}"
     )
-    if np.array_equal(turn, np.eye(3)):
-        return found._replace(cell=cell, notes=(*found.notes, told), basis=basis)
+    if np.array_equal(rotation, np.eye(3)):
+        return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
     return found._replace(
-        cell=cell, position=found.position @ turn.T, rotation=turn @ found.rotation,
-        velocity=None if found.velocity is None else found.velocity @ turn.T,
-        notes=(*found.notes, f"{told}; turned, contents included"), basis=basis,
+        cell=cell, position=found.position @ rotation.T, rotation=rotation @ found.rotation,
+        velocity=None if found.velocity is None else found.velocity @ rotation.T,
+        notes=(*found.notes, f"{note}; rotated, contents included"), basis=basis,
     )  # fmt: skip
 
 
@@ -129,30 +129,30 @@ def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configurati
         position=(found.position + shifts[:, None]).reshape(-1, 3), rotation=tiled(found.rotation),
         velocity=tiled(found.velocity), angular_momentum_body=tiled(found.angular_momentum_body),
         cell=cell * np.array(repeat)[:, None],
-        notes=(*found.notes, f"its {len(found.species)} molecules stand {' x '.join(map(str, repeat))} times"),
+        notes=(*found.notes, f"its {len(found.species)} molecules are repeated {' x '.join(map(str, repeat))} times"),
     )  # fmt: skip
 
 
 def _read_molecules(
-    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, held
+    path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, content
 ) -> Configuration:
     _check_types(path, atom_types or {}, species)
-    atoms = read_atoms(path, frame, atom_types, topology, held)
+    atoms = read_atoms(path, frame, atom_types, topology, content)
     notes = list(atoms.notes)
     if atoms.cell is not None:
-        handed = np.linalg.det(atoms.cell)
-        cell, turn = standard_rotation(atoms.cell)
-        if not np.array_equal(turn, np.eye(3)):
-            velocity = None if atoms.velocity is None else atoms.velocity @ turn.T
-            atoms = atoms._replace(position=atoms.position @ turn.T, velocity=velocity)
-            notes.append("its cell was turned, contents included, so that a is along x and b in the xy plane")
-        if handed < 0:
-            notes.append("its cell is left-handed: -c stands for c, which leaves the lattice as it is")
+        orientation = np.linalg.det(atoms.cell)
+        cell, rotation = standard_rotation(atoms.cell)
+        if not np.array_equal(rotation, np.eye(3)):
+            velocity = None if atoms.velocity is None else atoms.velocity @ rotation.T
+            atoms = atoms._replace(position=atoms.position @ rotation.T, velocity=velocity)
+            notes.append("its cell was rotated, contents included, so that a is along x and b in the xy plane")
+        if orientation < 0:
+            notes.append("its cell is left-orientation: -c replaces c, which does not change the lattice")
         if right_angled(cell):
             upright = np.diag(np.linalg.norm(cell, axis=1))
             if np.abs(upright - cell).max() > ROUNDING * cell.max():
-                told = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
-                notes.append(f"its angles of {told}° were taken for right ones")
+                angles = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
+                notes.append(f"its angles of {angles}° were set to right angles")
             cell = upright
         atoms = atoms._replace(cell=cell)
     if periodic and wanted is None:
@@ -163,10 +163,10 @@ def _read_molecules(
     matched = match(atoms, species, across, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
-        faults = _strange_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        faults = _unknown_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
         raise StructureError(str(path), faults)
     if len(matched.species) == 0:
-        raise StructureError(str(path), ["holds no atoms with mass, so no molecules"])
+        raise StructureError(str(path), ["has no atoms with mass"])
     notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
@@ -179,10 +179,10 @@ def _read_molecules(
 
 
 def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
-    """Raise StructureError for atom types named like no site or element of the scene."""
+    """Raise StructureError for atom types that are not sites or elements of the scene."""
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     faults = [
-        f"structure.atom_types.{number} = {name!r} is no site or element of the scene's molecules; there are "
+        f"structure.atom_types.{number} = {name!r} is not a site or element of the scene's molecules; there are "
         f"{', '.join(known)}{did_you_mean(name, known)}"
         for number, name in atom_types.items()
         if name not in (*known, "X")
@@ -191,58 +191,61 @@ def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]
         raise StructureError(str(path), faults)
 
 
-def _strange_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """Faults: atoms of the file whose mass is that of no site of the scene."""
+def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
+    """Messages on atoms of the file whose mass no site of the scene has."""
     if atoms.masses is None:
         return []
     masses = np.unique([mass for m in species for mass in m.masses[massive_sites(m)]])
-    strange = [
+    unknown = [
         f"{name} ({mass:g} u)"
         for name, mass in sorted(set(zip(atoms.names, atoms.masses.tolist(), strict=True)))
         if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
     ]
-    if not strange:
+    if not unknown:
         return []
-    there = ", ".join(f"{mass:g}" for mass in masses)
     return [
-        f"its atom types {', '.join(strange)} weigh what no site of the scene's molecules does ({there} u): say what "
-        "they are by structure.atom_types, or give the molecules these masses by masses_u"
+        f"its atom types {', '.join(unknown)} have masses of no site of the scene's molecules "
+        f"({', '.join(f'{mass:g}' for mass in masses)} u): set structure.atom_types, or these masses by masses_u"
     ]
 
 
 def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
-    """A note if masses of the file differ from those of the sites."""
+    """A note if masses in the file and in the scene differ."""
     if atoms.masses is None:
         return []
-    other = {}
+    different = {}
     for k, molecule in enumerate(species):
         for s, site in enumerate(massive_sites(molecule)):
-            own = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
+            members = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
             mass = float(molecule.masses[site])
-            for i in own[np.abs(atoms.masses[own] - mass) > SAME_MASS * mass]:
-                other[f"{atoms.names[i]} {atoms.masses[i]:g} against {molecule.site_names[site]} {mass:g} u"] = None
-    if not other:
+            for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
+                different[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
+    if not different:
         return []
-    return [f"masses of the scene count, not those of the file ({'; '.join(other)}): masses_u changes them"]
+    return [
+        f"the masses of the scene are used, not the masses in the file ({'; '.join(different)}): masses_u changes them"
+    ]
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
     """Raise StructureError for a start without a box."""
     if cell is None:
-        told = f" ({'; '.join(notes)})" if notes else ""
-        raise StructureError(str(path), [f"has no box{told}: give [box] lengths_A, or periodic = false"])
+        why = f" ({'; '.join(notes)})" if notes else ""
+        raise StructureError(str(path), [f"has no box{why}: give [box] lengths_A, or periodic = false"])
 
 
 def _massless(matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
-    """Notes on massless sites, which are placed by the template whatever the file says."""
+    """Notes on massless sites, whose positions follow from the template and not from the file."""
     lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
     expected = int(np.array(lacking)[matched.species].sum())
     there = sum(matched.massless.values())
     if there > expected:
-        return [f"{there - expected} sites without mass ({', '.join(matched.massless)}) that no model has: left out"]
+        return [f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no model: left out"]
     if there < expected:
         names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
-        return [f"{expected - there} sites without mass that the file lacks ({names}): built by the rigid template"]
+        return [
+            f"{expected - there} sites without mass are missing in the file ({names}): built from the rigid template"
+        ]
     return []
 
 
@@ -255,7 +258,9 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
         return None, None
     without = np.array(np.isnan(atoms.velocity).any(axis=1))
     if lost := sorted(i for run in matched.atoms for i in run[without[run]]):
-        notes.append(f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1}): none is used")
+        notes.append(
+            f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1}): no velocity is used"
+        )
         return None, None
     n = len(matched.species)
     velocity, angular = np.zeros((n, 3)), np.zeros((n, 3))
@@ -275,7 +280,7 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
 
 
 def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """A guess at the units, if nearest distances match the bonds of the molecules in another unit than Å."""
+    """A message if the nearest distances match the bonds of the molecules in another unit than Å."""
     from scipy.spatial import KDTree
     from scipy.spatial.distance import pdist
 
@@ -284,22 +289,22 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
         return []
     nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
     found = [
-        f"the coordinates seem to be in {unit}, not in Å as this format has them: atoms are {nearest:.3g} apart"
+        f"the coordinates seem to be in {unit}, not in Å as in this format: the nearest distance is {nearest:.3g}"
         for unit, angstrom in OTHER_UNITS.items()
         if min(bonds) / CLOSE <= nearest * angstrom <= max(bonds) * CLOSE
     ]
     return [] if min(bonds) / CLOSE <= nearest <= max(bonds) * CLOSE else found
 
 
-def _other_model(molecule: Molecule, marks: np.ndarray) -> str:
-    """What tells a molecule from the one of a saved state with these `Molecule.fingerprint`; empty if nothing does."""
-    own = np.array(molecule.fingerprint)
+def _other_model(molecule: Molecule, saved: np.ndarray) -> str:
+    """The difference between a molecule and a saved one with this `Molecule.fingerprint`; empty if there is none."""
+    here = np.array(molecule.fingerprint)
     names = ("mass, u", "moment of inertia 1, u Å²", "moment 2", "moment 3", "number of sites")
-    size = np.array([own[0], *[max(own[1:4].max(), marks[1:4].max())] * 3, 1.0])
+    size = np.array([here[0], *[max(here[1:4].max(), saved[1:4].max())] * 3, 1.0])
     differs = [
-        f"{name}: {there:.6g}, here {here:.6g}"
-        for name, there, here, scale in zip(names, marks, own, size, strict=True)
-        if abs(there - here) > SAME_MODEL * scale
+        f"{name}: {there:.6g}, here {value:.6g}"
+        for name, there, value, scale in zip(names, saved, here, size, strict=True)
+        if abs(there - value) > SAME_MODEL * scale
     ]
     return f"holds another {molecule.name} than the scene ({'; '.join(differs)})" if differs else ""
 
@@ -311,21 +316,18 @@ def _read_state(path: Path, species: list[Molecule]) -> Configuration:
     if missing := [name for name in saved.names if name not in known]:
         raise StructureError(str(path), [f"holds {', '.join(missing)}; the scene has {', '.join(known)}"])
     of_name = {molecule.name: molecule for molecule in species}
-    faults = (
-        [_other_model(of_name[name], marks) for name, marks in zip(saved.names, saved.models, strict=True)]
-        if (saved.models is not None)
-        else []
-    )
-    state, n, turning = saved.state, len(saved.species), len(saved.state.rotation) > 0
-    turned = [name for name in saved.names if of_name[name].inertia.any()]
-    if turned and not turning:
-        faults.append(f"holds no rotations, but {', '.join(turned)} can turn")
-    if faults := [fault for fault in faults if fault]:
+    models = () if saved.models is None else zip(saved.names, saved.models, strict=True)
+    faults = [fault for name, model in models if (fault := _other_model(of_name[name], model))]
+    state, n, has_rotations = saved.state, len(saved.species), len(saved.state.rotation) > 0
+    rotating = [name for name in saved.names if of_name[name].inertia.any()]
+    if rotating and not has_rotations:
+        faults.append(f"has no rotations, but {', '.join(rotating)} can rotate")
+    if faults:
         raise StructureError(str(path), faults)
     return Configuration(
         species=np.array([known.index(name) for name in saved.names])[saved.species], position=state.position,
-        rotation=state.rotation if turning else np.tile(np.eye(3), (n, 1, 1)), velocity=state.velocity,
-        angular_momentum_body=state.angular_momentum_body if turning else np.zeros((n, 3)),
-        cell=state.cell if np.isfinite(state.cell).all() else None, residual_rms=0.0, residual_max=0.0,
+        rotation=state.rotation if has_rotations else np.tile(np.eye(3), (n, 1, 1)), velocity=state.velocity,
+        angular_momentum_body=state.angular_momentum_body if has_rotations else np.zeros((n, 3)),
+        cell=state.cell if np.isfinite(state.cell).all() else None,
         number=saved.residue_number,
     )  # fmt: skip
