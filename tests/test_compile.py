@@ -34,6 +34,7 @@ from rigidmd.compile import (
     task,
 )
 from rigidmd.compile.cache import cache_folder
+from rigidmd.compile.layout import array_struct
 from rigidmd.compile.numba_private import CacheIndex, InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
@@ -207,7 +208,21 @@ def _tell(task_arguments, block):
     mixed.plane[0, 0] = -1.0
 
 
-def test_values_are_laid_down_as_compiled_code_has_them():
+def test_arrays_are_stored_as_layout_assumes():
+    kind, context = types.Array(types.float64, 2, "C"), cpu_target.target_context
+    model, assumed = context.data_model_manager[kind], array_struct(2)
+    stored = [
+        (name, context.get_abi_sizeof(context.get_value_type(model.get_member_fe_type(name)))) for name in model._fields
+    ]
+    fields = [(name, ctypes.sizeof(c_type)) for name, c_type in assumed._fields_]
+    size = context.get_abi_sizeof(context.get_value_type(kind))
+    assert (fields, ctypes.sizeof(assumed)) == (stored, size), (
+        f"Numba {numba.__version__} stores an array as {stored} (name, bytes), {size} bytes in all; rigidmd/compile/"
+        f"layout.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `_fill` there"
+    )
+
+
+def test_values_are_stored_as_in_compiled_code():
     plane, found = np.arange(6.0).reshape(2, 3), np.zeros(12)
     inner = (np.uint16(65000), (np.array([7, 8, 9], np.int32),))
     turned, code = np.arange(6, dtype=np.float32).reshape(2, 3).T, Code(add=(_add, (np.zeros(3), 0.0)))
@@ -219,8 +234,8 @@ def test_values_are_laid_down_as_compiled_code_has_them():
     assert ctypes.sizeof(struct._memory) == context.get_abi_sizeof(context.get_value_type(struct.kind))
 
 
-def test_what_cannot_be_laid_down_or_has_another_type_is_named():
-    with pytest.raises(TypeError, match="unicode_type cannot be struct down"):
+def test_what_cannot_be_stored_or_has_another_type_is_named():
+    with pytest.raises(TypeError, match="unicode_type cannot be an argument of a task"):
         NumbaStruct((1.0, "text"))
     code = Code(add=(_add, (np.zeros(3), 0.0)))
     assert code.to_struct((np.zeros(2), 1.0)).kind == numba.typeof((np.zeros(3), 0.0))
@@ -484,6 +499,20 @@ def test_a_kernel_is_compiled_once_for_all_constant_arguments():
 
 
 # --- rules that sources keep -----------------------------------------------------------------------------------------
+
+
+def test_code_for_llvm_does_not_rely_on_typed_pointers():
+    """llvmlite removes them: loads and address computations name their type."""
+    needed, found = {"load": "typ", "load_atomic": "typ", "gep": "source_etype"}, []
+    for path in (ROOT / "rigidmd").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            name, of_builder = node.func.attr, ast.unparse(node.func.value) in ("builder", "b")
+            lacks = of_builder and needed.get(name) not in (None, *(key.arg for key in node.keywords))
+            if name == "as_pointer" or lacks:
+                found.append(f"{path.name}:{node.lineno}: {ast.unparse(node)}")
+    assert found == []
 
 
 def compiled_functions():

@@ -19,8 +19,7 @@ from rigidmd.compile import second_process, thread_pool
 from rigidmd.compile.kernels import compiler_options, kernel
 from rigidmd.compile.layout import AddressType, NumbaStruct
 from rigidmd.compile.numba_private import LINKED_OPTIONS, compile_callback, load_callback, reference_counting
-
-POINTER = ir.IntType(8).as_pointer()
+from rigidmd.compile.pointers import cast_pointer, function_at, pointer_to
 
 
 class TaskArguments(types.Type):
@@ -39,7 +38,7 @@ class TaskArguments(types.Type):
 @register_model(TaskArguments)
 class _TaskArgumentsModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, POINTER)
+        super().__init__(manager, kind, cgutils.voidptr_t)  # the pointers that Numba keeps in variables
 
 
 @intrinsic
@@ -47,7 +46,7 @@ def pack_arguments(typing, content):
     """The address of a value on the stack, valid until the calling function returns."""
 
     def emit(context, builder, signature, arguments):
-        return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), POINTER)
+        return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), cgutils.voidptr_t)
 
     return TaskArguments(content)(content), emit
 
@@ -57,8 +56,8 @@ def load_arguments(typing, task_arguments):
     """The value at the address of task arguments."""
 
     def emit(context, builder, signature, arguments):
-        kind = context.get_value_type(task_arguments.content).as_pointer()
-        content = builder.load(builder.bitcast(arguments[0], kind))
+        kind = context.get_value_type(task_arguments.content)
+        content = builder.load(cast_pointer(builder, arguments[0], kind), typ=kind)
         return impl_ret_borrowed(context, builder, task_arguments.content, content)
 
     return task_arguments.content(task_arguments), emit
@@ -217,8 +216,9 @@ def address_of(typing, code, name, task_arguments):
     index = code.index_of(name.literal_value, task_arguments)
 
     def emit(context, builder, signature, arguments):
-        table = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
-        return builder.load(builder.gep(table, [ir.IntType(64)(index)]))
+        word = ir.IntType(64)
+        table = builder.inttoptr(arguments[0], pointer_to(word))
+        return builder.load(builder.gep(table, [word(index)], source_etype=word), typ=word)
 
     return types.intp(code, name, task_arguments), emit
 
@@ -228,8 +228,8 @@ def _call_at(typing, address, task_arguments, block):
     """Call the machine code at an address."""
 
     def emit(context, builder, signature, arguments):
-        kind = ir.FunctionType(ir.VoidType(), [POINTER, ir.IntType(64)])
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, ir.IntType(64)])
+        builder.call(function_at(builder, arguments[0], kind), arguments[1:])
         return context.get_dummy_value()
 
     return types.void(types.intp, task_arguments, types.intp), emit

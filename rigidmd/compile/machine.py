@@ -6,6 +6,7 @@ import numba
 from llvmlite import binding, ir
 from numba.core.registry import cpu_target
 
+from rigidmd.compile.pointers import pointer_to
 from rigidmd.errors import SettingError
 
 #: LLVM names of the target: this machine, or the one set by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES.
@@ -33,9 +34,9 @@ def _widest() -> int:
     """
     module = ir.Module()
     vector = ir.VectorType(ir.IntType(32), 16)
-    add = ir.Function(module, ir.FunctionType(ir.VoidType(), [vector.as_pointer()]), "add")
+    add = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer_to(vector)]), "add")
     builder = ir.IRBuilder(add.append_basic_block())
-    value = builder.load(add.args[0])
+    value = builder.load(add.args[0], typ=vector)
     builder.store(builder.add(value, value), add.args[0])
     builder.ret_void()
     target = binding.Target.from_triple(TRIPLE).create_target_machine(cpu=PROCESSOR, features=_FEATURES)

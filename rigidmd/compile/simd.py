@@ -23,6 +23,7 @@ from rigidmd.compile import (
     simd_math,  # noqa: F401  (registers exp, log, ... of vectors)
 )
 from rigidmd.compile.machine import IS_X86
+from rigidmd.compile.pointers import cast_pointer, element_pointer
 from rigidmd.compile.simd_types import LANE_COUNTS, Lanes, Mask, emit_broadcast, multiply_add
 
 #: Whether this machine has the instruction of `permute_two`, and estimates of 14 bits.
@@ -50,8 +51,8 @@ def zeros(shape: int | tuple[int, ...], dtype) -> np.ndarray:
 
 def _address(context, builder, array_type, array, index, lanes):
     """Pointer to the vector that starts at array[index]."""
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
+    address = element_pointer(context, builder, array_type, array, index)
+    return cast_pointer(builder, address, context.get_value_type(lanes))
 
 
 def _is_contiguous(array) -> bool:
@@ -65,7 +66,7 @@ def _is_contiguous_1d(array) -> bool:
 def _load(lanes, array):
     def emit(context, builder, signature, arguments):
         address = _address(context, builder, array, *arguments, lanes)
-        return builder.load(address, align=array.dtype.bitwidth // 8)
+        return builder.load(address, align=array.dtype.bitwidth // 8, typ=context.get_value_type(lanes))
 
     return lanes(array, types.intp), emit
 
@@ -83,8 +84,8 @@ def load_scalar(typing, array, index):
         return None
 
     def emit(context, builder, signature, arguments):
-        data = context.make_array(array)(context, builder, arguments[0]).data
-        return builder.load(builder.gep(data, [arguments[1]]))
+        address = element_pointer(context, builder, array, *arguments)
+        return builder.load(address, typ=context.get_data_type(array.dtype))
 
     return array.dtype(array, types.intp), emit
 
@@ -116,8 +117,9 @@ def load_broadcast(typing, array, index):
     lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
     def emit(context, builder, signature, arguments):
-        data = context.make_array(array)(context, builder, arguments[0]).data
-        return emit_broadcast(context, builder, builder.load(builder.gep(data, [arguments[1]])), array.dtype, lanes)
+        address = element_pointer(context, builder, array, *arguments)
+        number = builder.load(address, typ=context.get_data_type(array.dtype))
+        return emit_broadcast(context, builder, number, array.dtype, lanes)
 
     return lanes(array, types.intp), emit
 
@@ -376,8 +378,8 @@ def store_even_lanes(typing, array, index, x):
         half = builder.trunc(
             builder.bitcast(whole, ir.VectorType(ir.IntType(64), count)), ir.VectorType(ir.IntType(8), count)
         )
-        data = context.make_array(array)(context, builder, target).data
-        builder.store(half, builder.bitcast(builder.gep(data, [index]), half.type.as_pointer()), align=1)
+        address = element_pointer(context, builder, array, target, index)
+        builder.store(half, cast_pointer(builder, address, half.type), align=1)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, x), emit
@@ -553,9 +555,10 @@ def add_lane_sums(typing, array, index, step, x, y):
             sums = [_shuffle(builder, four, four, lanes) for four in fours for lanes in ((0, 1), (2, 3))][:3]
         data = context.make_array(array)(context, builder, into).data
         for pair in sums:
-            address = builder.bitcast(builder.gep(data, [index]), pair.type.as_pointer())
-            align = array.dtype.bitwidth // 8
-            builder.store(builder.fadd(builder.load(address, align=align), pair), address, align=align)
+            element = builder.gep(data, [index], source_etype=context.get_data_type(array.dtype))
+            address, align = cast_pointer(builder, element, pair.type), array.dtype.bitwidth // 8
+            total = builder.fadd(builder.load(address, align=align, typ=pair.type), pair)
+            builder.store(total, address, align=align)
             index = builder.add(index, step)
         return context.get_dummy_value()
 
@@ -630,6 +633,7 @@ def evaluate_cubic(typing, coefficients, t):
 
     def emit(context, builder, signature, arguments):
         table = context.make_array(coefficients)(context, builder, arguments[0])
+        kind = context.get_data_type(coefficients.dtype)
         vector, whole = context.get_value_type(lanes), ir.VectorType(ir.IntType(64), lanes.count)
         value = arguments[1] if isinstance(t, Lanes) else builder.bitcast(arguments[1], vector)
         last = builder.sub(builder.sdiv(builder.extract_value(table.shape, 0), ir.IntType(64)(4)), ir.IntType(64)(1))
@@ -644,9 +648,9 @@ def evaluate_cubic(typing, coefficients, t):
             index = builder.select(builder.icmp_signed("<", index, last), index, last)
             index = builder.select(builder.icmp_signed(">", index, ir.IntType(64)(0)), index, ir.IntType(64)(0))
             starts = builder.insert_element(starts, builder.sitofp(index, vector.element), lane)
-            address = builder.gep(table.data, [builder.mul(index, ir.IntType(64)(4))])
+            address = builder.gep(table.data, [builder.mul(index, ir.IntType(64)(4))], source_etype=kind)
             for c in range(4):
-                number = builder.load(builder.gep(address, [ir.IntType(64)(c)]))
+                number = builder.load(builder.gep(address, [ir.IntType(64)(c)], source_etype=kind), typ=kind)
                 if number.type != vector.element:
                     number = builder.fptrunc(number, vector.element)
                 parts[c] = builder.insert_element(parts[c], number, lane)

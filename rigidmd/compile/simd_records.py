@@ -8,6 +8,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from rigidmd.compile.pointers import cast_pointer
 from rigidmd.compile.simd_types import LANE_COUNTS, Lanes
 
 
@@ -29,10 +30,11 @@ def _transpose(builder, rows: list) -> list:
 
 def _pointers(context, builder, array, value, first, size: int, count: int):
     """Pointers to the numbers of records first ... first + count - 1, [record][number]."""
-    data = context.make_array(array)(context, builder, value).data
+    data, kind = context.make_array(array)(context, builder, value).data, context.get_data_type(array.dtype)
     start = builder.mul(first, first.type(size))
     return [
-        [builder.gep(data, [builder.add(start, first.type(size * n + k))]) for k in range(size)] for n in range(count)
+        [builder.gep(data, [builder.add(start, first.type(size * n + k))], source_etype=kind) for k in range(size)]
+        for n in range(count)
     ]
 
 
@@ -49,12 +51,13 @@ def _loader(size: int):
             pointers = _pointers(context, builder, array, *arguments, size, count)
             columns, whole = [], size - size % count
             for k in range(0, whole, count):
-                rows = [builder.load(builder.bitcast(record[k], kind.as_pointer()), align=align) for record in pointers]
+                rows = [builder.load(cast_pointer(builder, p[k], kind), align=align, typ=kind) for p in pointers]
                 columns += _transpose(builder, rows)
             for k in range(whole, size):
                 column = ir.Constant(kind, ir.Undefined)
                 for n in range(count):
-                    column = builder.insert_element(column, builder.load(pointers[n][k]), ir.IntType(32)(n))
+                    number = builder.load(pointers[n][k], typ=kind.element)
+                    column = builder.insert_element(column, number, ir.IntType(32)(n))
                 columns.append(column)
             return context.make_tuple(builder, found, columns)
 
@@ -77,7 +80,7 @@ def _storer(size: int):
             whole = size - size % count
             for k in range(0, whole, count):
                 for n, row in enumerate(_transpose(builder, vectors[k : k + count])):
-                    builder.store(row, builder.bitcast(pointers[n][k], row.type.as_pointer()), align=align)
+                    builder.store(row, cast_pointer(builder, pointers[n][k], row.type), align=align)
             for k in range(whole, size):
                 for n in range(count):
                     builder.store(builder.extract_element(vectors[k], ir.IntType(32)(n)), pointers[n][k])

@@ -26,6 +26,7 @@ from numba.extending import intrinsic
 from rigidmd.compile.kernels import compiler_options, kernel
 from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS
 from rigidmd.compile.numba_private import compile_callback, reference_counting
+from rigidmd.compile.pointers import function_at, pointer_to
 
 INT64 = ir.IntType(64)
 # Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to different lines.
@@ -51,7 +52,8 @@ def _on_cell(emit_on, result=types.int64):
 
     def typed(typing, pool, cell, *values):
         def emit(context, builder, signature, arguments):
-            at = builder.inttoptr(builder.add(arguments[0], builder.mul(arguments[1], INT64(8))), INT64.as_pointer())
+            address = builder.add(arguments[0], builder.mul(arguments[1], INT64(8)))
+            at = builder.inttoptr(address, pointer_to(INT64))
             return emit_on(builder, at, *arguments[2:])
 
         return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
@@ -62,7 +64,7 @@ def _on_cell(emit_on, result=types.int64):
 @intrinsic
 def _read(typing, pool, cell):
     """The number in a cell."""
-    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8))(typing, pool, cell)
+    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8, typ=INT64))(typing, pool, cell)
 
 
 @intrinsic
@@ -133,7 +135,7 @@ def call_address(typing, address, task_arguments, block):
 
     def emit(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [INT64, INT64])
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        builder.call(function_at(builder, arguments[0], kind), arguments[1:])
         return context.get_dummy_value()
 
     return types.void(types.intp, types.intp, types.intp), emit
@@ -233,7 +235,7 @@ def run_on_all_threads(typing, address, task_arguments, blocks):
     def emit(context, builder, signature, arguments):
         memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, INT64, SYMBOL)
         kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
-        run_task = builder.inttoptr(builder.load(memory), kind.as_pointer())
+        run_task = function_at(builder, builder.load(memory, typ=INT64), kind)
         content = builder.ptrtoint(arguments[1], INT64)
         builder.call(run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]])
         return context.get_dummy_value()
