@@ -208,6 +208,7 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
+    "core.shipped": "CHAPTERS DOCS find_example notebooks",
     "analysis.result": "Curve AnalysisResult Value converged_value",
     "analysis.rigid_frames": "fit_frames",
     "io.bonds": "bonds connections",
@@ -345,7 +346,6 @@ HOMES = {
     "run.resume": "state_from",
     "run.signals": "interruptible",
     "scene.start": "Box",
-    "scene.shipped": "CHAPTERS DOCS find_example notebooks",
     "studies.accuracy.averages": "measure_averages start_of_last_stage",
     "studies.compare": "compare describe_run_comparison",
     "studies.export": "export",
@@ -365,7 +365,7 @@ HOMES = {
 RENAMED = {
     "BATH_STEP": "core.integrators:THERMOSTAT",
     "SAMPLE_NUMBERS": "engines.samples:NUMBERS",
-    "SHIPPED": "scene.shipped:SYSTEMS",
+    "SHIPPED": "core.shipped:SYSTEMS",
     "draw_analysis_curve": "analysis.files:draw_curve",
     "averages_failures": "studies.accuracy.averages_report:describe_failures",
     "axis_settings": "studies.sweep.axes:settings",

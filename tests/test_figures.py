@@ -67,7 +67,7 @@ def test_long_curves_have_no_gaps(points):
 
 def test_no_figure_is_written_past_this():
     written = [path.name for path in (ROOT / "rigidmd").rglob("*.py") if ".savefig(" in path.read_text()]
-    assert written == ["figure.py"]
+    assert written == ["style.py"]
 
 
 def test_every_figure_shows_names_as_they_are_written():

@@ -11,7 +11,7 @@ def add(commands: Commands) -> None:
 
 
 def _examples(options: argparse.Namespace) -> int:
-    from rigidmd.scene.shipped import examples, notebooks, scripts
+    from rigidmd.core.shipped import examples, notebooks, scripts
 
     scenes = examples()
     kinds = {

@@ -12,7 +12,7 @@ def add(commands: Commands) -> None:
 
 
 def _help(options: argparse.Namespace) -> int:
-    from rigidmd.scene.shipped import chapter_text, contents
+    from rigidmd.core.shipped import chapter_text, contents
 
     if options.chapter is not None:
         print(chapter_text(options.chapter))

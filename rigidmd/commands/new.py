@@ -16,8 +16,8 @@ def add(commands: Commands) -> None:
 
 
 def _new(options: argparse.Namespace) -> int:
+    from rigidmd.core.shipped import copy_example, find_example, series_of
     from rigidmd.scene import Scene
-    from rigidmd.scene.shipped import copy_example, find_example, series_of
 
     example = find_example(options.name)
     path = Path(options.output or f"{example.name}{example.path.suffix}")

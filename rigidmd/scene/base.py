@@ -21,7 +21,7 @@ from rigidmd.core.toml import (
     shorten_repr,
 )
 from rigidmd.errors import SceneError
-from rigidmd.scene.shipped import examples
+from rigidmd.core.shipped import examples
 from rigidmd.scene.validation import (
     Section,
     did_you_mean,

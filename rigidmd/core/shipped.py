@@ -14,7 +14,6 @@ from rigidmd.core.files import atomic_file
 from rigidmd.errors import InputError, OutputError
 
 PACKAGE = Path(__file__).parent.parent
-
 #: In a wheel the scenes are inside the package; in a checkout or an editable install they are next to it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
@@ -23,7 +22,6 @@ NOTEBOOK, SCRIPT = ".ipynb", ".py"
 _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
 #: Kind of an example by the extension of its file.
 KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
-
 #: In the order of the list.
 CHAPTERS = (
     "top", "water", "molecule", "ensembles", "looking", "notebook", "measuring", "studies", "ase", "engines",
