@@ -435,7 +435,7 @@ def test_check_says_what_kind_of_molecule_it_is(own, capsys):
     assert main(["check", str(own / "own.toml")]) == 0
     out = capsys.readouterr().out
     assert "planar, 12 sites, 78.1140 u, net charge +0.6 e" in out
-    assert "net charge of all of them: +4.8 e" in out
+    assert "net charge: +4.8 e" in out
 
 
 def test_a_run_keeps_the_table_and_runs_again_from_its_copy(own):
@@ -478,7 +478,7 @@ def test_copied_files_do_not_rename_a_species(named, own):
         (('parameters = "aromatic.toml"', 'parameters = "aromatic.csv"'), "must be a .toml file"),
         (('parameters = "aromatic.toml"', ""), "a geometry file needs sites, or a file of parameters"),
         (('file = "benzene.xyz"', 'model = "spce"'), "parameters would do nothing"),
-        (('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'), "sites: S is no atom of it"),
+        (('"aromatic.toml"', '"aromatic.toml"\nsites = [{ name = "S" }]'), "sites: S is not an atom of it"),
     ],
 )
 def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
@@ -490,7 +490,7 @@ def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (('name = "H"', 'name = "F"'), "atom H: no entry of sites or of parameters has this name or is called H"),
+        (('name = "H"', 'name = "F"'), "atom H: no entry of sites or of parameters has this name or the name H"),
         (('name = "N"', 'name = "H"'), "sites: H appears twice"),
         (("sigma_A = 2.42\n", ""), "needs both sigma_A and one of epsilon_kJ_mol, epsilon_kcal_mol, epsilon_K"),
         (("epsilon_kcal_mol = 0.03", "epsilon_kcal_mol = 0.03\nepsilon_K = 15.0"), "not both"),
@@ -695,7 +695,7 @@ def test_the_residue_and_charge_of_a_new_model(own, capsys, monkeypatch):
         "CRYST1   30.000   30.000   30.000  90.00  90.00  90.00\n" + "\n".join(lines) + "\nEND\n"
     )
     assert main(["models", "--from", "lig.pdb", "--parameters", "aromatic.toml", "-o", "x.toml"]) == 0
-    assert "its cell is left out" in capsys.readouterr().err
+    assert "its cell is ignored" in capsys.readouterr().err
     assert read_molecule(own / "x.toml").residue_names == ("LIG",)
     for charge, said in (("0.1151", "+0.0001 e, nearly but not exactly 0"), ("0.6", "+0.485 e, not a whole number")):
         (own / "aromatic.toml").write_text(TABLE.replace("charge_e = 0.115", f"charge_e = {charge}"))
@@ -714,8 +714,8 @@ CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
         (["--from", "."], ".: is a folder"),
         (["--from", "own.toml", "-o", "x.toml"], "its format is unknown to ASE"),
         (["--from", "two.xyz"], "holds 2 structures one after another: keep one"),
-        (["--from", "pair.xyz"], "pair.xyz: holds 2 molecules N2: keep one"),
-        (["--from", "cut.xyz"], "joined through the sides of its cell"),
+        (["--from", "pair.xyz"], "pair.xyz: has 2 molecules N2: keep one"),
+        (["--from", "cut.xyz"], "bonded through the faces of its cell"),
         (["--from", "benzene.xyz", "--parameters", "none.toml"], "none.toml: there is no such file"),
         (["--from", "benzene.xyz", "--parameters", "poor.toml"], "atom H: no entry of the table has this name"),
         (["--from", "benzene.xyz", "--name", ""], "name: is ''"),

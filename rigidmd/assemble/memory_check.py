@@ -1,7 +1,6 @@
-"""The memory that a scene of molecules needs: known, and compared with what is free, before any of it is used.
+"""Compares the memory that a scene needs with the free memory, before any of it is used.
 
-NumPy's arrays of zeros take no memory before something is written to them, so the arrays of an engine can be made,
-added up and thrown away at no cost.
+NumPy's arrays of zeros take no memory before they are written, so the arrays of an engine can be made and added up.
 """
 
 from collections.abc import Iterator
@@ -20,27 +19,28 @@ from rigidmd.units import FEMTOSECOND
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
 
-#: Bytes that a system takes while it is built; measured: 310 of argon, 500 of nitrogen, 640 of SPC/E, 690 of TIP4P.
+#: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500 of nitrogen, 640 of
+#: SPC/E, 690 of TIP4P.
 BYTES_PER_MOLECULE, BYTES_PER_SITE = 200, 130
-#: Of a site where a trajectory is written, by MDAnalysis for the most part; measured: 430 of SPC/E.
+#: Bytes per site if a trajectory is written, mostly by MDAnalysis; measured: 430 of SPC/E.
 BYTES_PER_TRAJECTORY_SITE = 430
-#: Of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
+#: Bytes per sample of a body; measured: a snapshot of its state 1.9 kB, its columns at the end 0.85 kB.
 BYTES_PER_SAMPLE = 2700
-#: Of a line of log.csv, which the run keeps as numbers; measured: 300 while it runs, 870 when it is summarised. Of a
-#: frame in a file, whose time is kept.
+#: Bytes per line of log.csv, which the run keeps as numbers (measured: 300 while it runs, 870 in the summary), and per
+#: frame of a file, whose time is kept.
 BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
 ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
 
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
-    """Raise SceneError if there is no room for so many molecules with so many sites in all."""
+    """Raise SceneError if these numbers of molecules and sites in all exceed the memory."""
     needed = BYTES_PER_MOLECULE * molecules + BYTES_PER_SITE * sites
     if fault := memory_shortage(needed, f"a system of {molecules} molecules with {sites} sites"):
         raise SceneError(source, [f"not enough memory: {fault}: take fewer molecules"])
 
 
 def check_memory_of_samples(scene: BodyScene) -> None:
-    """Raise SceneError if there is no room for the samples of a resolved scene of a body."""
+    """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
     run, interval = scene.run, not_none(scene.output.interval_s)
     samples = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
     if fault := memory_shortage(BYTES_PER_SAMPLE * samples, f"a run with {samples:.3g} samples"):
@@ -48,10 +48,10 @@ def check_memory_of_samples(scene: BodyScene) -> None:
 
 
 def check_memory(system: "System") -> None:
-    """Raise SceneError if there is no room for a run of a system: states, forces, lists, grids, sums."""
+    """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids, samples."""
     try:
         needed = bytes_of(system)
-    except MemoryError as error:  # NumPy's says which array the system refused
+    except MemoryError as error:  # of NumPy, with the shape of the array
         shape, dtype = getattr(error, "shape", ()), getattr(error, "dtype", np.uint8)
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
         free = format_gigabytes(free_memory())
@@ -66,7 +66,7 @@ def check_memory(system: "System") -> None:
 
 
 def observation_count(system: "System", interval: float) -> float:
-    """How often a run is observed at an interval (ps) and at the ends of its stages."""
+    """Number of observations of a run at an interval (ps) and at the ends of its stages."""
     return sum(
         2 + stage.duration / (interval if stage.is_auto else max(interval, stage.timestep_fs * FEMTOSECOND))
         for stage in system.scene.stages
@@ -74,41 +74,34 @@ def observation_count(system: "System", interval: float) -> float:
 
 
 def bytes_of_samples(system: "System") -> float:
-    """Bytes that the lines of the log and the times of frames take by the end of a run."""
+    """Bytes of the lines of the log and the times of frames at the end of a run."""
     output = system.scene.output
     frames = observation_count(system, output.trajectory_interval_ps) if output.trajectory else 0
     return BYTES_PER_LOG_LINE * observation_count(system, output.log_interval_ps) + BYTES_PER_FRAME * frames
 
 
 def bytes_of(system: "System") -> int:
-    """Bytes of the arrays of a run. There are three states, the start, the one that moves and the last good one, and
-    two loads, of steps and of looks; and there are the samples."""
+    """Bytes of a run: three states (start, present, last good one), two loads (of steps and observations), samples."""
     state = system.state
-    written = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
-    fixed = (system.engine().new_workspaces(state), system.model)
-    return (
-        3 * array_bytes(state)
-        + 2 * array_bytes(no_load(state))
-        + array_bytes(fixed)
-        + written
-        + round(bytes_of_samples(system))
-    )
+    trajectory = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
+    arrays = 3 * array_bytes(state) + 2 * array_bytes(no_load(state))
+    arrays += array_bytes((system.engine().new_workspaces(state), system.model))
+    return arrays + trajectory + round(bytes_of_samples(system))
 
 
 def array_bytes(value: tuple) -> int:
-    """Bytes of all arrays in nested tuples; each array counts once, and so does memory that several have in common."""
+    """Bytes of all arrays in nested tuples. Memory that several arrays use counts once."""
     return sum({id(owner): owner.nbytes for owner in map(_owner, _arrays(value))}.values())
 
 
 def _owner(array: np.ndarray) -> np.ndarray:
-    """The array that has the memory of another one."""
+    """The array whose memory an array uses."""
     while isinstance(array.base, np.ndarray):
         array = array.base
     return array
 
 
 def _arrays(value) -> Iterator[np.ndarray]:
-    """All arrays in nested tuples."""
     if isinstance(value, np.ndarray):
         yield value
     elif isinstance(value, tuple):

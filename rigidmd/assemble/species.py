@@ -1,4 +1,4 @@
-"""The species of a scene: their rigid templates, and which molecules are frozen."""
+"""The species of a scene: their rigid molecules, and which molecules are frozen."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from rigidmd.scene.validation import not_none
 
 
 def species_of(scene: MolecularScene) -> list[Molecule]:
-    """The species of a scene, in its order. Raises SceneError with every fault."""
+    """The species of a scene, in its order. Raises SceneError with all errors."""
     found, faults = [], []
     for k, entry in enumerate(scene.molecules):
         try:
@@ -31,9 +31,8 @@ def species_of(scene: MolecularScene) -> list[Molecule]:
         except InputError as error:
             faults += [f"molecules.{k}: {error.where}: {fault}" for fault in error.errors]
     names = [m.name for m in found]
-    faults += [
-        f"molecules: {name} appears twice; name them apart" for name in sorted(set(names)) if names.count(name) > 1
-    ]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    faults += [f"molecules: {name} appears twice; give these species different names" for name in twice]
     if faults:
         raise SceneError(scene.source, faults)
     return found
@@ -49,7 +48,8 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
         if entry.file is None:
             sites = with_parameters(not_none(entry.sites), table)
         else:
-            sites = _sites_from_file(scene, entry, table)
+            where = "sites or of parameters" if entry.parameters is not None else "sites"
+            sites = sites_of_geometry(scene.path(entry.file), entry.sites or (), table, where)
         found = molecule(entry.label, sites)
     if entry.masses_u is not None:
         found = with_masses(found, entry.masses_u)
@@ -57,31 +57,24 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     return Molecule(**{**vars(found), **changed})
 
 
-def _sites_from_file(scene: MolecularScene, entry: Molecules, table: tuple[Site, ...]) -> tuple[Site, ...]:
-    where = "sites or of parameters" if entry.parameters is not None else "sites"
-    return sites_of_geometry(scene.path(not_none(entry.file)), entry.sites or (), table, where)
+def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
+    """Sites with positions from a file and parameters from given entries or a table, by atom name or else by element.
 
-
-def sites_of_geometry(path: Path, own: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
-    """Sites: positions from a file, parameters from entries of one's own or a table, by atom name or else by element.
-
-    where : what entries are called in messages. Raises StructureError with all faults.
+    where : name of the entries in messages. Raises StructureError with all errors.
     """
-    faults = []
-    sites = []
-    used = set()
+    faults, sites, used = [], [], set()
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
-        match, shared = find_site(own, name, element), find_site(table, name, element)
+        match, shared = find_site(given, name, element), find_site(table, name, element)
         if match is None and shared is None:
-            faults.append(f"atom {name}: no entry of {where} has this name or is called {element}")
+            faults.append(f"atom {name}: no entry of {where} has this name or the name {element}")
             continue
         used.add(match.name if match else "")
         entries = [s for s in (match, shared) if s is not None]
-        given = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
+        mass = next((s.mass_u for s in entries if s.mass_u is not None), float(mass))
         element = next((s.element for s in entries if s.element != "X"), element)
-        known = {"name": name[:5], "element": element, "mass_u": given, "position_A": tuple(map(float, position))}
+        known = {"name": name[:5], "element": element, "mass_u": mass, "position_A": tuple(map(float, position))}
         sites.append(match.model_copy(update=known) if match else Site(**known))
-    faults += [f"sites: {s.name} is no atom of it" for s in own if s.name not in used]
+    faults += [f"sites: {s.name} is not an atom of it" for s in given if s.name not in used]
     if faults:
         raise StructureError(str(path), list(dict.fromkeys(faults)))
     return with_parameters(tuple(sites), table)
@@ -90,23 +83,27 @@ def sites_of_geometry(path: Path, own: tuple[Site, ...], table: tuple[Site, ...]
 def split_frozen(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
-    """Species, index (n,) into them, which of them are frozen, and faults. A partly frozen species becomes two."""
+    """Species, index (n,) into them, mask of frozen species, error messages. A partly frozen species becomes two."""
     species, index, faults = list(species), index.copy(), []
     frozen = [entry.frozen is True for entry in scene.molecules]
     for k, entry in enumerate(scene.molecules):
-        own = index == k
-        chosen = np.zeros(len(index), bool)
+        of_species = index == k
+        selected = np.zeros(len(index), bool)
         for first, last in entry.frozen_spans:
-            here = own & (first <= number) & (number <= last)
-            if not here.any() or last > number[own].max():
-                there = f"they have {number[own].min()} to {number[own].max()}" if own.any() else "there are none"
-                asked = f"{first}" if first == last else f"{first}-{last}"
-                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {asked}; {there}")
-            chosen |= here
-        if chosen.any() and (chosen == own).all():
+            in_range = of_species & (first <= number) & (number <= last)
+            if not in_range.any() or last > number[of_species].max():
+                there = (
+                    f"they have {number[of_species].min()} to {number[of_species].max()}"
+                    if of_species.any()
+                    else "there are none"
+                )
+                numbers = f"{first}" if first == last else f"{first}-{last}"
+                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {numbers}; {there}")
+            selected |= in_range
+        if selected.any() and (selected == of_species).all():
             frozen[k] = True
-        elif chosen.any():
-            index[chosen] = len(species)
+        elif selected.any():
+            index[selected] = len(species)
             species.append(species[k])
             frozen.append(True)
     if frozen and all(frozen[k] for k in np.unique(index)):

@@ -1,11 +1,11 @@
-"""Stages in words: how they move, what they keep, which distribution they sample."""
+"""Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved quantities."""
 
 from rigidmd.scene.stage import COMPRESSIBILITY, Stage
 from rigidmd.units import FEMTOSECOND
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
 STIFFEST, SOFTEST = 2e-7, 100.0
-#: Of each ensemble, the distribution that it samples and what it conserves.
+#: Ensemble -> the distribution that it samples, and the conserved energy.
 DISTRIBUTIONS = {
     "nve": ("the microcanonical distribution", "energy"),
     "nph": ("the isoenthalpic distribution", "enthalpy with the energy of the piston"),
@@ -18,20 +18,20 @@ DISTRIBUTIONS = {
 
 
 def describe_stage(stage: Stage) -> list[str]:
-    """Two sentences: steps, thermostat and barostat; what is sampled and what is conserved. For a minimisation: what is
-    minimised, and the limits of convergence."""
+    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. Of a minimisation: the
+    minimised quantity; the limits of convergence."""
     if stage.is_minimisation:
         return _minimisation(stage)
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
     if stage.is_auto:
-        asked = f"{stage.trajectory_error or 0:g} of Q or X"
+        error = f"{stage.trajectory_error or 0:g} of Q or X"
         if stage.energy_error_kT:
-            asked = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
+            error = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
         elif stage.bias_kT:
-            asked = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
+            error = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
         text = (
-            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {asked}"
+            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {error}"
         )
     if stage.has_thermostat:
         text += f", {_thermostat(stage)}"
@@ -63,14 +63,14 @@ def _thermostat(stage: Stage) -> str:
 
 
 def _barostat(stage: Stage) -> str:
-    own = stage.barostat_kind.replace("_", " ") or "a piston"
-    text = f"{_pressure(stage)} bar by {own}, {stage.pressure_coupling.replace('_', '-')}"
+    kind = stage.barostat_kind.replace("_", " ") or "a piston"
+    text = f"{_pressure(stage)} bar by {kind}, {stage.pressure_coupling.replace('_', '-')}"
     if stage.barostat_kind != "monte_carlo":
         text += f", {stage.barostat_time:g} ps"
     if stage.barostat_kind:
         every = stage.moves_every
         text += f", a move every {every} steps" if every > 1 else ", a move every step"
-    water = ", that of water" if stage.compressibility == COMPRESSIBILITY else ""
+    water = ", of water" if stage.compressibility == COMPRESSIBILITY else ""
     return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
 
 
@@ -86,26 +86,26 @@ def _ramp(ends: tuple[float, float]) -> str:
 
 
 def _sampled(stage: Stage) -> str:
-    """The distribution, up to the error of the step."""
-    law = DISTRIBUTIONS[stage.ensemble][0]
+    """The sampled distribution, up to the error of the step."""
+    found = DISTRIBUTIONS[stage.ensemble][0]
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
-        law += ", with the invariant measure of the shape"
+        found += ", with the invariant measure of the shape"
     first, last = stage.pressures if stage.has_barostat else (0, 0)
     if (stage.has_thermostat and len(set(stage.temperatures)) > 1) or first != last:
-        law += " that temperature and pressure have at each moment"
-    return law
+        found += ", at the temperature and pressure of each moment"
+    return found
 
 
 def _conserved(stage: Stage) -> str:
     """The conserved quantities, up to the error of the step."""
-    kept = DISTRIBUTIONS[stage.ensemble][1]
-    return f"{kept}, total momentum" if stage.keeps_momentum else f"{kept}, not the total momentum"
+    energy = DISTRIBUTIONS[stage.ensemble][1]
+    return f"{energy}, total momentum" if stage.keeps_momentum else f"{energy}, not the total momentum"
 
 
 def stage_notes(stages: tuple[Stage, ...]) -> list[str]:
-    """Notes on these stages."""
+    """Notes on compressibilities that no substance has."""
     return [
-        f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is that of no matter (diamond has "
+        f"stages.{k}: compressibility_per_bar = {stage.compressibility:g} is outside the range of substances (diamond "
         f"{STIFFEST:g}, water {COMPRESSIBILITY:g}, a gas at 1 bar 1): is it in another unit? The box will "
         f"{'hardly move' if stage.compressibility < STIFFEST else 'try moves that are too long'}"
         for k, stage in enumerate(stages)

@@ -1,4 +1,4 @@
-"""Rows of stages: integrator, thermostat and barostat of a stage as flows."""
+"""The integrator of a stage: its scheme with the flows of the thermostat and the barostat."""
 
 from math import inf
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from rigidmd.engines.system import System
 from rigidmd.scene.stage import Six, Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 
-#: Largest change of the volume in a Monte Carlo move, in standard deviations of what it fluctuates by.
+#: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
 WIDTH = 2.0
 
 
@@ -22,13 +22,13 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
     scene, stage = system.scene, system.scene.stages[k]
     found = stage.scheme
-    if (own := system.thermostat) is not None:
-        bath = own.for_stage(system, k) if hasattr(own, "for_stage") else own
-        found = found.with_thermostat(bath, halved=getattr(bath, "halved", True))
+    if (user := system.thermostat) is not None:
+        thermostat = user.for_stage(system, k) if hasattr(user, "for_stage") else user
+        found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
     elif stage.has_thermostat:
         found = found.with_thermostat(thermostat_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
     elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
-        # a stage without a thermostat among others with one has one that rests: all then run the same machine code
+        # An idle thermostat, so that all stages run the same machine code.
         idle = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
         found = found.with_thermostat(idle)
     if stage.ensemble == "npt":
@@ -41,7 +41,6 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
 
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
-    """The thermostat of stage k."""
     stage, freedom = system.scene.stages[k], system.freedom_in(k)
     thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)
     match stage.thermostat_kind:
@@ -56,7 +55,6 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
-    """The barostat of stage k."""
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     first, last = stage.pressures

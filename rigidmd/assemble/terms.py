@@ -19,14 +19,14 @@ from rigidmd.scene.models import Molecule, gather_per_molecule, sites_named
 from rigidmd.units import KJ_PER_MOL
 
 
-def _sites_of(species: list[Molecule], model: Model, chosen: list[np.ndarray]):
-    """Sites of a law: chosen[k] lists the sites of species k that have it."""
-    offsets = [m.positions_body[c] for m, c in zip(species, chosen, strict=True)]
+def _sites_of(species: list[Molecule], model: Model, indices: list[np.ndarray]):
+    """The sites on which a pair potential acts; indices[k] (s,) are its sites of species k."""
+    offsets = [m.positions_body[c] for m, c in zip(species, indices, strict=True)]
     return sites_of(model.species, offsets, model.inverse_inertia)
 
 
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
-    """For each species (pairs, 2, sites): whether the first or second name of an entry of forces.pairs means the site.
+    """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs means the site.
 
     Raises SceneError.
     """
@@ -34,11 +34,11 @@ def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndar
     faults = []
     for n, entry in enumerate(scene.forces.pairs):
         for side, text in enumerate(entry.sites):
-            meant = sites_named(species, text)
-            for k, of in enumerate(meant):
-                found[k][n, side] = of
-            if not any(of.any() for of in meant):
-                known = dict.fromkeys(f"{m.name}.{own}" for m in species for own in m.site_names)
+            masks = sites_named(species, text)
+            for k, mask in enumerate(masks):
+                found[k][n, side] = mask
+            if not any(mask.any() for mask in masks):
+                known = dict.fromkeys(f"{m.name}.{site}" for m in species for site in m.site_names)
                 faults.append(f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}")
     if faults:
         raise SceneError(scene.source, faults)
@@ -56,20 +56,20 @@ def interactions(
     found, index = Interactions({}, {}), model.species
     frozen = (model.inverse_mass == 0)[index]
     named = _named_pairs(scene, species)
-    chosen = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
-    if scene.forces.lennard_jones and any(len(c) for c in chosen):
-        law = _lennard_jones(scene, species, index, named, chosen)
-        sites = _sites_of(species, model, chosen)
-        found.terms["lennard_jones"] = pair_forces(law, sites, exclusion_groups(sites, frozen))
+    indices = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
+    if scene.forces.lennard_jones and any(len(c) for c in indices):
+        potential = _lennard_jones(scene, species, index, named, indices)
+        sites = _sites_of(species, model, indices)
+        found.terms["lennard_jones"] = pair_forces(potential, sites, exclusion_groups(sites, frozen))
         found = found._replace(
-            tail=tail(law) if scene.forces.tail_correction else None,
-            notes=_short_cutoff_notes(law, species, index, chosen),
+            tail=tail(potential) if scene.forces.tail_correction else None,
+            notes=_short_cutoff_notes(potential, species, index, indices),
         )
-    chosen = [np.flatnonzero(m.charges != 0) for m in species]
-    if scene.forces.electrostatics == "none" or not any(len(c) for c in chosen):
+    indices = [np.flatnonzero(m.charges != 0) for m in species]
+    if scene.forces.electrostatics == "none" or not any(len(c) for c in indices):
         return found
-    sites = _sites_of(species, model, chosen)
-    charged = ChargedSites(species, index, frozen, chosen, sites, exclusion_groups(sites, frozen))
+    sites = _sites_of(species, model, indices)
+    charged = ChargedSites(species, index, frozen, indices, sites, exclusion_groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
     return Interactions(
         found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error,
@@ -79,16 +79,16 @@ def interactions(
 
 def _lennard_jones(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, named: list[np.ndarray],
-    chosen: list[np.ndarray],
+    indices: list[np.ndarray],
 ) -> LennardJones:  # fmt: skip
-    """The law of the sites `chosen` of each species. Raises SceneError."""
+    """The Lennard-Jones potential of the sites `indices` of each species. Raises SceneError."""
     forces, cutoff = scene.forces, scene.forces.cutoff_A or inf
     pairs = [
         [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
-        for k, (m, c) in enumerate(zip(species, chosen, strict=True))
+        for k, (m, c) in enumerate(zip(species, indices, strict=True))
     ]
     kinds = sorted({pair for of_species in pairs for pair in of_species})
-    of_species = [np.array([kinds.index(pair) for pair in own], np.int32) for own in pairs]
+    of_species = [np.array([kinds.index(pair) for pair in entries], np.int32) for entries in pairs]
     kind = gather_per_molecule(of_species, index)
     sigma, epsilon = np.array([pair[:2] for pair in kinds]).T
     special = {
@@ -99,26 +99,28 @@ def _lennard_jones(
         if one[2 * n] and other[2 * n + 1]
     }
     start = forces.switch_start_A or cutoff
-    with np.errstate(over="ignore", invalid="ignore"):  # told below
-        law = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
-    if not (np.isfinite(law.c12).all() and np.isfinite(law.c6).all()):
+    with np.errstate(over="ignore", invalid="ignore"):  # checked below
+        potential = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
+    if not (np.isfinite(potential.c12).all() and np.isfinite(potential.c6).all()):
         raise SceneError(scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
-    return law
+    return potential
 
 
 def _short_cutoff_notes(
-    law: LennardJones, species: list[Molecule], index: np.ndarray, chosen: list[np.ndarray]
+    potential: LennardJones, species: list[Molecule], index: np.ndarray, indices: list[np.ndarray]
 ) -> tuple[str, ...]:
-    """A note if the cutoff is within the minimum of an energy, on the pair with the most distant one."""
+    """A note if the cutoff is below the minimum of an energy, on the pair with the most distant minimum."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        minimum = np.nan_to_num((2 * law.c12 / law.c6) ** (1 / 6), posinf=0.0)
+        minimum = np.nan_to_num((2 * potential.c12 / potential.c6) ** (1 / 6), posinf=0.0)
     i, j = np.unravel_index(minimum.argmax(), minimum.shape)
-    if not law.cutoff < (1 - MINIMUM_TOLERANCE) * minimum[i, j]:
+    if not potential.cutoff < (1 - MINIMUM_TOLERANCE) * minimum[i, j]:
         return ()
-    names = [np.array([f"{m.name}.{m.site_names[k]}" for k in c], object) for m, c in zip(species, chosen, strict=True)]
+    names = [
+        np.array([f"{m.name}.{m.site_names[k]}" for k in c], object) for m, c in zip(species, indices, strict=True)
+    ]
     of_sites = gather_per_molecule(names, index)
-    first, second = (of_sites[np.flatnonzero(law.kind == kind)[0]] for kind in (i, j))
-    return (short_cutoff_note(law.cutoff, f"{first} and {second}", float(minimum[i, j])),)
+    first, second = (of_sites[np.flatnonzero(potential.kind == kind)[0]] for kind in (i, j))
+    return (short_cutoff_note(potential.cutoff, f"{first} and {second}", float(minimum[i, j])),)
 
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
@@ -133,17 +135,17 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
     elif "coulomb_reciprocal" not in terms:
         out.append(f"sums over periodic images, Fourier transforms: electrostatics is {scene.forces.electrostatics}")
     elif scene.forces.electrostatics == "ewald":
-        out.append("Fourier transforms: electrostatics is ewald, wave by wave")
+        out.append("Fourier transforms: electrostatics is ewald, a direct sum over k-vectors")
     if isinstance(model.rotor, NoRotor):
         out.append("rotation and torques: every molecule is a point")
     if space.volume == inf:
-        out.append("periodic images: there is no box")
+        out.append("periodic images: no box")
     if not any(stage.has_thermostat for stage in scene.stages):
-        out.append("thermostat: no stage has a temperature to keep")
+        out.append("thermostat: no NVT or NPT stage")
     if not any(stage.has_barostat for stage in scene.stages):
-        out.append("barostat: no stage has a pressure to keep")
+        out.append("barostat: no NPT or NPH stage")
     if scene.run.remove_momentum_interval_ps is False:
         out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
     if not scene.forces.tail_correction:
-        out.append("tail correction: not asked for")
+        out.append("tail correction: not requested")
     return out

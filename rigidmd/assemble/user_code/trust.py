@@ -1,4 +1,4 @@
-"""Python files of users, which run only where a user says so: forces of a scene, and analyses."""
+"""Python files with user code, which run only if the user trusts them: forces of a scene, and analyses."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,15 +14,15 @@ _TRUSTED: set[str] = set()
 
 
 def trust(path: str | Path) -> None:
-    """Let scenes run a Python file: one with these contents, wherever it lies. Raises SceneError.
+    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError.
 
-    A file is code: it can do whatever you can. Read it before. On the command line, --trust FILE does the same.
+    The code can do anything that you can do: read it before. On the command line, --trust FILE does the same.
     """
     _TRUSTED.add(digest_of(_source(Path(path), "--trust")))
 
 
 def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
-    """Raise SceneError for a trusted file that is none of those that a scene runs: nothing of it would be run."""
+    """Raise SceneError for a trusted file that the scene does not run."""
     named = [path for key, path in scene.inputs.items() if key.endswith(".module")]
     contents = [_source(path, "forces.custom") for path in named]
     for path in paths:
@@ -37,18 +37,13 @@ def trusted_module(path: Path, key: str) -> ModuleType:
     """The module of a file that a scene names by `key`, if it is trusted. Raises SceneError."""
     source = _source(path, key)
     if digest_of(source) not in _TRUSTED:
-        raise SceneError(
-            key,
-            [
-                f"{path} is Python code, which can do whatever you can: read it, and if you trust it, add "
-                f"--trust {path} (in Python: rigidmd.trust({str(path)!r}))"
-            ],
-        )
+        why = "is Python code, which can do whatever you can: read it, and if you trust it, add"
+        raise SceneError(key, [f"{path} {why} --trust {path} (in Python: rigidmd.trust({str(path)!r}))"])
     try:
         return module_of(source, str(path), USER_FILE_PREFIX)
     except SceneError:
         raise
-    except (Exception, SystemExit) as error:  # whatever a stranger's file raises
+    except (Exception, SystemExit) as error:  # user code may raise anything
         line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
         raise SceneError(key, [f"{path}{line} raised {describe_error(error)}"]) from error
 
