@@ -222,8 +222,8 @@ RINGS = [
     Mutation(
         "B15", "run: the total momentum is removed with the mass of the first species for all",
         "dynamics/step_loop.py",
-        "            own = model.mass[model.species[m]]\n            mass += own",
-        "            own = model.mass[0]\n            mass += own",
+        "            m_i = model.mass[model.species[m]]\n            mass += m_i",
+        "            m_i = model.mass[0]\n            mass += m_i",
         ("test_wiring.py::test_a_mixture_is_brought_to_rest_by_one_velocity_for_all",),
     ),
     Mutation(

@@ -49,8 +49,8 @@ def driving(box, model, state, room, k, volume, thermal):
 
 
 @numba.njit
-def log_chance(box, model, state, room, h):
-    return boxes.log_chance(box, model, state, room, h)
+def log_acceptance(box, model, state, room, h):
+    return boxes.log_acceptance(box, model, state, room, h)
 
 
 @numba.njit
@@ -160,7 +160,7 @@ def prepared(system, engine, box, before, after, room, h):
     drift(box, system.model, before, own, h, room.strain[1], room.strain[2])
     room.velocity[:] = before.velocity
     room.cell[:] = before.cell
-    return log_chance(box, system.model, after, room, h)
+    return log_acceptance(box, system.model, after, room, h)
 
 
 def gas(count, thermostat, box_for):
@@ -338,7 +338,7 @@ def test_a_barostat_does_not_go_with_a_field_on_net_charges(coupled):
 def test_a_box_that_becomes_too_small_or_boils_stops_in_words():
     small = small_scene({"argon": 40}, 20.0, stages=[NPT | {"pressure_bar": 20000.0, "barostat_interval_ps": 0.002,
         "duration_ps": 20.0, "barostat_time_ps": 0.05}], forces={"cutoff_A": 9.0}, output=QUIET)  # fmt: skip
-    with pytest.raises(SimulationError, match="too small for the cut-off"):
+    with pytest.raises(SimulationError, match="too small for the cutoff"):
         Simulation(small).run()
     boils = small_scene({"argon": 40}, 14.0, stages=[NPT | {"barostat_interval_ps": 0.002, "duration_ps": 200.0,
         "barostat_time_ps": 0.02, "compressibility_per_bar": 1e-3}], forces={"cutoff_A": 6.0}, output=QUIET)  # fmt: skip

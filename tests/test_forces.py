@@ -282,7 +282,9 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
             origin_vector=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.origin_vector.dtype),
         )
         pairs.counters[USABLE] = 0
-        cramped.append(own._replace(pairs=pairs, sums=own.sums._replace(forces_behind=own.sums.forces_behind[:, :8].copy())))
+        cramped.append(
+            own._replace(pairs=pairs, sums=own.sums._replace(forces_behind=own.sums.forces_behind[:, :8].copy()))
+        )
     engine._workspaces = tuple(cramped)
     assert energies(engine, state) == expected
 
@@ -318,11 +320,11 @@ def test_a_cutoff_within_which_are_too_many_sites_is_refused():
     engine.evaluate(state)
     (own,) = engine.workspaces.values()
     own.pairs.needed[0, NEIGHBORS_OF_ONE] = MAX_NEIGHBORS + 1
-    with pytest.raises(SimulationError, match="sites are within the cut-off of 8 Å: take a shorter one"):
+    with pytest.raises(SimulationError, match="sites are within the cutoff of 8 Å: take a shorter one"):
         own.with_capacity(state.cell)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _ahead(c, clusters, first, arity):
     return ahead(c, clusters, first, arity)
 
@@ -419,7 +421,7 @@ def test_a_cell_that_becomes_too_small_for_the_cut_off_stops_in_words():
     engine.evaluate(state)  # a thinner skin serves
     state.cell[:] *= 0.99
     state.position[:] *= 0.99
-    with pytest.raises(SimulationError, match=r"the box has become too small for the cut-off of 6.9 Å: half its"):
+    with pytest.raises(SimulationError, match=r"the box has become too small for the cutoff of 6.9 Å: half its"):
         engine.evaluate(state)
 
 
@@ -534,7 +536,7 @@ def test_a_list_for_places_ahead_serves_longer_and_misses_nothing():
     assert builds[0] < 0.95 * builds[1]
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def places_ahead(sites, state, lead, places):
     for i in range(len(places)):
         for k, x in enumerate(predict_site(sites, state, sites.molecule[i], i, lead)):
@@ -613,7 +615,7 @@ def test_the_self_energy_of_the_reaction_field():
     assert system.constants["reaction_field_self"] == pytest.approx(-4 * field * dipole2 * 138935.457644, rel=1e-9)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def pair_forces_at(argon, charges, r2, found):
     for k in range(len(r2)):
         found[k, 0] = energy_and_force(argon, 2e9, 3e6, r2[k])[1]
@@ -661,7 +663,10 @@ def test_the_correction_of_a_switch_gives_the_force_of_its_product(start):
     corrections = laws[0].correction, laws[1].switched
     assert all(isinstance(correction, SwitchCorrection) for correction in corrections)
     shape = Unmodified(9.0)
-    plain = (one._replace(truncation=shape).for_slots(1, np.float32), charges._replace(truncation=shape).for_slots(1, np.float32))
+    plain = (
+        one._replace(truncation=shape).for_slots(1, np.float32),
+        charges._replace(truncation=shape).for_slots(1, np.float32),
+    )
     r = np.linspace(start - 1, 9.0, 2001)
     found, without = np.empty((2, len(r), 2))
     pair_forces_at(*laws, r**2, found)

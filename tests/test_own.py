@@ -161,19 +161,19 @@ def test_constants_become_numbers_of_the_formula_and_whole_powers_products():
         ("r.real", "no place in a formula"),
         ("tan(r)", "not a function of one number"),
         ("A + B", "does not depend on the distance"),
-        ("r**9**9**9", "9 ** 9 ** 9 is no finite real number"),
+        ("r**9**9**9", "9 ** 9 ** 9 is not a finite real number"),
         ("r/0", "divides by 0"),
-        ("1e999*r", "no real number"),
-        ("((((9**200)**200)**200)**200)/r", "(9 ** 200) ** 200 is no finite real number"),
-        ("sin((1e8**200)**200)/r", "100000000.0 ** 200 is no finite real number"),
+        ("1e999*r", "not a real number"),
+        ("((((9**200)**200)**200)**200)/r", "(9 ** 200) ** 200 is not a finite real number"),
+        ("sin((1e8**200)**200)/r", "100000000.0 ** 200 is not a finite real number"),
         ("((9**200*r)**200)**200", "has numbers of more than 300 digits"),
         ("exp(999999999*log(9*r))", "has numbers of more than 300 digits"),
         ("((r**200)**200)**200", "beyond 200"),
-        ("sin(exp(exp(exp(9))))/r", "exp(exp(9)) is no finite real number"),
-        ("(-8)**(1/3)*r", "no real number"),
-        ("r*log(0)", "no finite real number"),
+        ("sin(exp(exp(exp(9))))/r", "exp(exp(9)) is not a finite real number"),
+        ("(-8)**(1/3)*r", "not a real number"),
+        ("r*log(0)", "not a finite real number"),
         ("9" * 4500 + "*r", "characters"),
-        ("9" * 400 + "*r", "no finite real number"),
+        ("9" * 400 + "*r", "not a finite real number"),
         ("log(" * 21 + "r" + ")" * 21, "more than 20 functions"),
         ("1/(r+" * 11 + "r" + ")" * 11, "more than 20 functions"),
         ("+".join(["r"] * 2000), "characters"),
@@ -270,7 +270,7 @@ def test_a_table_is_as_good_as_it_says():
     for bad, word in ((([1, 2], [1, 2]), "8 distances"), ((r, r**2), "does not repel"), ((r[::-1], r), "ascending")):
         with pytest.raises(FormulaError, match=word):
             formula_of_table(*bad, 9.0)
-    with pytest.raises(FormulaError, match=r"ends at 10 Å, before the cut-off"):
+    with pytest.raises(FormulaError, match=r"ends at 10 Å, before the cutoff"):
         formula_of_table(r, 1 / r, 12.0)
 
 

@@ -225,8 +225,8 @@ def test_what_drives_the_cell_follows_a_ramp_of_the_pressure():
 
 
 @numba.njit
-def _log_chance(box, model, state, room, h):
-    return boxes.log_chance(box, model, state, room, h)
+def _log_acceptance(box, model, state, room, h):
+    return boxes.log_acceptance(box, model, state, room, h)
 
 
 def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules():
@@ -239,7 +239,7 @@ def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecu
     state.cell[:] *= 1.02
     before, after = 14.0**3, (1.02 * 14.0) ** 3
     work = (150.0 + 500 * BAR * (after - before)) / (310 * KELVIN)
-    found = _log_chance(box, system.model, state, room, 0.01)
+    found = _log_acceptance(box, system.model, state, room, 0.01)
     assert found == pytest.approx(12 * np.log(after / before) - work, rel=1e-9)
 
 

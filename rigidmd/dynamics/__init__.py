@@ -1,1 +1,1 @@
-"""Steps in time: `advance` is the compiled loop over a row of flows; kicks, drifts and baths are flows of it."""
+"""Integration in time: the compiled loop over the flows of a scheme: kicks, drifts, thermostats, barostats."""

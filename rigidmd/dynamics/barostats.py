@@ -1,11 +1,11 @@
-"""Boxes: flows that change the cell at a pressure, chosen by type; a constant volume compiles none.
+"""Barostats: flows that change the cell at a pressure, chosen by type; a constant volume compiles none.
 
 A move multiplies the cell (rows a, b, c) and the centres of mass from the right by a lower triangular matrix T, which
-keeps a along x and b in the xy plane. Rotations and angular momenta stay as they are: what answers is the molecular
-virial sum F (x) R, with W_ij = sum F_i R_j in `tally[1:]`.
+keeps a along x and b in the xy plane. Rotations and angular momenta do not change, so the pressure follows from the
+molecular virial sum F (x) R, with W_ij = sum F_i R_j in `tally[1:]`.
 
-`apply_barostat(barostat, ...)` acts where the row of a step has BOX, `scale_box(barostat, ...)` where it has STRETCH. What a box does to
-the energy of the molecules is in `state.energy_ledger[WORK]`.
+`apply_barostat` acts where a scheme has the flow BAROSTAT, `scale_box` where it has SCALE_BOX. The energy that a
+barostat adds to the molecules is summed in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log, sqrt
@@ -24,19 +24,19 @@ from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, compute_load
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
-#: Which coordinate moves each component (-1: none).
+#: The strain coordinate of each component (-1: none).
 COUPLINGS = {
     "isotropic": (0, 0, 0, -1, -1, -1),
     "semi_isotropic": (0, 0, 1, -1, -1, -1),
     "anisotropic": (0, 1, 2, -1, -1, -1),
     "flexible": (0, 1, 2, 3, 4, 5),
 }
-#: The drift of a move is no longer than this strain; noise comes on top. It bounds what a bad start does in one move.
+#: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start in one move.
 LONGEST_DRIFT = 0.01
 
 
 class Pressure(NamedTuple):
-    """The pressure asked for, by component; it changes evenly over a stretch. u/(Å ps²)."""
+    """The target pressure, by component; it changes linearly over a run segment. u/(Å ps²)."""
 
     first: tuple[float, float, float, float, float, float]
     last: tuple[float, float, float, float, float, float]
@@ -44,30 +44,28 @@ class Pressure(NamedTuple):
 
 
 class NoBarostat(NamedTuple):
-    """Constant volume."""
-
     rate: float = 0.0
 
 
 class CellRescaling(NamedTuple):
-    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107), made exact by a test.
+    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107), with an acceptance test.
 
     The strain of each coordinate drifts by beta h/(3 tau) (P - P0) and gets noise of variance 2 kT beta h/(3 V tau n),
-    n the components that share it: d ln V = (beta/tau) (P - P0) dt + sqrt(2 kT beta/(V tau)) dW where all three do
-    (anisotropic cells: Del Tatto, Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139). P is that of virial and kinetic
-    energy at the moment; translational momenta are divided by T. The move is then accepted or taken back by the rule of
-    Metropolis and Hastings, so that neither h, tau nor beta leaves an error in what is sampled: exp(-(H + P0 V)/kT)
-    with the measure dV and, of a cell that changes its shape, the invariant measure of the strain.
+    with n the number of components of the coordinate: d ln V = (beta/tau) (P - P0) dt + sqrt(2 kT beta/(V tau)) dW for
+    all three (anisotropic cells: Del Tatto, Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139). P follows from the
+    virial and the present kinetic energy; translational momenta are divided by T. The move is accepted or rejected by
+    the rule of Metropolis and Hastings, so that h, tau and beta cause no error in the sampled distribution,
+    exp(-(H + P0 V)/kT) with the measure dV and, if the cell changes its shape, the invariant measure of the strain.
 
-    Deviatoric pressures act as true (Cauchy) stress: their work is that in the mean volume of the move.
+    Deviatoric pressures act as true (Cauchy) stress: their work is computed with the mean volume of the move.
     """
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     pressure: Pressure
     rate: float  # compressibility over time constant, Å ps²/u/ps
     coordinate: tuple[int, int, int, int, int, int]  # of COUPLINGS
-    at_rest: tuple[float, float, float]  # 1 of each axis along which the total momentum is kept at zero
-    tail: tuple[float, float]  # dispersion beyond the cut-off: its energy times V, its pressure times V²
+    at_rest: tuple[float, float, float]  # 1 for each axis along which the total momentum is kept at zero, else 0
+    tail: tuple[float, float]  # dispersion beyond the cutoff: energy times V, pressure times V²
     key: Key
 
 
@@ -78,7 +76,7 @@ class VolumeMoves(NamedTuple):
     thermal_energy: Ramp
     pressure: Pressure
     width: float  # largest change of the volume, Å³
-    molecules: float  # that move
+    molecules: float  # number of molecules that are not frozen
     tail: tuple[float, float]
     key: Key
 
@@ -86,9 +84,9 @@ class VolumeMoves(NamedTuple):
 class Piston(NamedTuple):
     """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant enthalpy.
 
-    H = K + U + P0 V + Pi²/(2 M) in centres and momenta scaled by the edge is followed by kicks of Pi (BOX) and changes
-    of V (STRETCH), each exact, beside those of the molecules. Pi is the last number of `state.extra_variables`; what P0 V and the
-    piston gain is what `energy_ledger[WORK]` loses.
+    H = K + U + P0 V + Pi²/(2 M) in centres and momenta scaled by the edge. The flows are kicks of Pi (BAROSTAT) and
+    changes of V (SCALE_BOX), each exact. Pi is the last number of `state.extra_variables`. What P0 V and the piston
+    gain is subtracted from `energy_ledger[WORK]`.
     """
 
     pressure: Pressure
@@ -97,63 +95,53 @@ class Piston(NamedTuple):
 
 
 def piston(pressure: Pressure, period: float, compressibility: float, volume: float, tail: tuple) -> Piston:
-    """A piston with which a volume of this compressibility (Å ps²/u) swings with a period (ps).
-
-    It hangs on the spring dP/dV = -1/(compressibility V), so that M = (period/2 pi)²/(compressibility V).
-    """
+    """A piston for which a volume of this compressibility (Å ps²/u) oscillates with a period (ps). The spring is dP/dV
+    = -1/(compressibility V), so M = (period/2 pi)²/(compressibility V)."""
     return Piston(pressure, compressibility * volume * (2 * np.pi / period) ** 2, tail)
 
 
 class BarostatWorkspace(NamedTuple):
-    """Where a move is made and, if it is rejected, taken back."""
+    """Arrays to make a move and to undo it if it is rejected."""
 
-    tally: np.ndarray  # (2, 10) energies and virials: now, before the move; of a piston virials only
-    strain: np.ndarray  # (3, 6) of the move; its drift; its variance
-    matrices: np.ndarray  # (2, 3, 3) T, its inverse
+    tally: np.ndarray  # (2, 10) energies and virials: now, before the move; virials only for a piston
+    strain: np.ndarray  # (3, 6) strain of the move, its drift, its variance
+    matrices: np.ndarray  # (2, 3, 3) T and its inverse
     position: np.ndarray  # as in State
     velocity: np.ndarray
     cell: np.ndarray
     load: Load
-    known: np.ndarray  # (1,) whether tally[0] is that of `load`
+    known: np.ndarray  # (1,) whether tally[0] belongs to `load`
     counts: np.ndarray  # (2,) moves tried, accepted
 
 
 def barostat_workspace(state: State) -> BarostatWorkspace:
-    """Room for the molecules of a state."""
     return BarostatWorkspace(
-        np.zeros((2, TALLY_SIZE)),
-        np.zeros((3, 6)),
-        np.zeros((2, 3, 3)),
-        state.position.copy(),
-        state.velocity.copy(),
-        state.cell.copy(),
-        no_load(state),
-        np.zeros(1, np.int64),
-        np.zeros(2, np.int64),
-    )
+        np.zeros((2, TALLY_SIZE)), np.zeros((3, 6)), np.zeros((2, 3, 3)), state.position.copy(), state.velocity.copy(),
+        state.cell.copy(), no_load(state), np.zeros(1, np.int64), np.zeros(2, np.int64)
+    )  # fmt: skip
 
 
-def compute_load_for_barostat(barostat, terms, state, load, workspace, flows, which):
+def compute_step_load(barostat, terms, state, load, workspace, flows, which):
     """Forces and torques at the present positions; a status code.
 
-    which : PLAIN, or TALLIED for energies and virials too. A step in which the box moves always computes virials, and
-        energies too where the move depends on them
+    which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always computes virials, and
+        energies if the move depends on them
     """
     raise TypeError("compiled code only")
 
 
 def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """The flow of a box over a time h, in place; a status code. cursor : see `advance`."""
+    """The flow of a barostat over a time h, in place; a status code. progress : see `advance`."""
     raise TypeError("compiled code only")
 
 
 def scale_box(barostat, state, h):
-    """The flow of the volume by its own inertia, in place."""
+    """The flow of the volume by the inertia of a piston, in place."""
     raise TypeError("compiled code only")
 
 
-@implements(compute_load_for_barostat, inline=True)
-def _compute_load_for_barostat(barostat, terms, state, load, workspace, flows, which):
+@implements(compute_step_load, inline=True)
+def _compute_step_load(barostat, terms, state, load, workspace, flows, which):
     if is_a(barostat, NoBarostat):
         return lambda barostat, terms, state, load, workspace, flows, which: compute_load(terms, state, load, which)
 
@@ -163,9 +151,8 @@ def _compute_load_for_barostat(barostat, terms, state, load, workspace, flows, w
         workspace.known[0] = 0
         for k in range(len(flows.kind)):
             if flows.kind[k] == BAROSTAT and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
-                return compute_load_and_virial(
-                    terms, state, load, workspace, which if which == WITH_ENERGIES else needed
-                )
+                energies = which == WITH_ENERGIES
+                return compute_load_and_virial(terms, state, load, workspace, which if energies else needed)
         return compute_load(terms, state, load, which)
 
     return with_virials
@@ -173,10 +160,8 @@ def _compute_load_for_barostat(barostat, terms, state, load, workspace, flows, w
 
 @kernel(inline=True)
 def compute_load_and_virial(terms, state, load, workspace, which):
-    """Forces and torques and virial at the present positions, with TALLIED also energies; a status code.
-
-    which : TALLIED or PRESSED
-    """
+    """Forces, torques and virial at the present positions, with WITH_ENERGIES also energies; a status code. which :
+    WITH_ENERGIES or WITH_VIRIALS"""
     status = compute_load(terms, state, load, which)
     for k in range(TALLY_SIZE):
         workspace.tally[0, k] = 0.0
@@ -242,7 +227,7 @@ def _apply_barostat(barostat, model, terms, state, load, workspace, progress, h,
         if status != OK:
             return status
         progress[2] = 0
-        chance = log_chance(barostat, model, state, workspace, h)
+        chance = log_acceptance(barostat, model, state, workspace, h)
         u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
         workspace.counts[0] += 1
         if log(u) < chance:
@@ -258,14 +243,14 @@ def _apply_barostat(barostat, model, terms, state, load, workspace, progress, h,
 
 @kernel(inline=True)
 def target_pressure(pressure, state, k):
-    """Component k of the pressure asked for in the step that is being taken."""
+    """Component k of the target pressure in the present step."""
     fraction = (state.step[NOW] - state.step[ORIGIN] + 1) / pressure.steps
     return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction
 
 
 @kernel
 def save_before_move(state, load, workspace):
-    """Remember what a move changes."""
+    """Copy what a move changes."""
     copy(state.position, workspace.position)
     copy(state.velocity, workspace.velocity)
     copy(load.force, workspace.load.force)
@@ -286,12 +271,12 @@ def undo_move(state, load, workspace):
 
 
 def propose_strain(barostat, model, state, workspace, h, draw):
-    """Draw the strain of a move, with its drift and variance, into workspace.strain, and T and its inverse."""
+    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
     raise TypeError("compiled code only")
 
 
-def log_chance(barostat, model, state, workspace, h):
-    """The logarithm of the chance of a move that has been made to be kept."""
+def log_acceptance(barostat, model, state, workspace, h):
+    """The logarithm of the acceptance probability of a move that has been made."""
     raise TypeError("compiled code only")
 
 
@@ -323,7 +308,7 @@ def _propose(barostat, model, state, workspace, h, draw):
 
 @kernel
 def drift(barostat, model, state, workspace, h, mean, variance):
-    """Mean and variance of the strain of a move, by component (6,), into `mean` and `variance`; 0 of what stays."""
+    """Write mean and variance of the strain of a move, by component (6,); 0 for a component that does not move."""
     volume = volume_of(state.cell)
     thermal = ramp_value(barostat.thermal_energy, state)
     for k in range(6):
@@ -342,7 +327,7 @@ def drift(barostat, model, state, workspace, h, mean, variance):
 
 @kernel
 def strain_force(barostat, model, state, workspace, k, volume, thermal):
-    """What drives component k of the strain: minus the derivative of H + P0 V, u Å²/ps²."""
+    """The generalised force on component k of the strain: minus the derivative of H + P0 V, u Å²/ps²."""
     i, j = COMPONENTS[k]
     total = workspace.tally[0, 1 + 3 * j + i] - volume * target_pressure(barostat.pressure, state, k)
     for m in range(len(state.velocity)):
@@ -354,7 +339,7 @@ def strain_force(barostat, model, state, workspace, k, volume, thermal):
 
 @kernel
 def set_matrices(workspace):
-    """T and its inverse of the strain: exp of the diagonal, the rest as it is."""
+    """Set T and its inverse: T is the strain, with exp of its diagonal."""
     matrix, inverse, strain = workspace.matrices[0], workspace.matrices[1], workspace.strain[0]
     matrix[:] = 0.0
     inverse[:] = 0.0
@@ -369,15 +354,15 @@ def set_matrices(workspace):
 
 @kernel
 def apply_strain(barostat, state, workspace):
-    """Multiply centres and cell by T; momenta, where the box changes them, by its inverse."""
+    """Multiply centres and cell by T; momenta, if the barostat changes them, by its inverse."""
     matrix = workspace.matrices[0]
-    times(state.position, matrix)
-    times(state.cell, matrix)
+    multiply_rows(state.position, matrix)
+    multiply_rows(state.cell, matrix)
     rescale_velocities(barostat, state, workspace)
 
 
 @kernel(inline=True)
-def times(rows, matrix):
+def multiply_rows(rows, matrix):
     """Multiply vectors (n, 3), rows, from the right by a lower triangular matrix, in place."""
     for m in range(len(rows)):
         x, y, z = rows[m, 0], rows[m, 1], rows[m, 2]
@@ -387,7 +372,7 @@ def times(rows, matrix):
 
 
 def rescale_velocities(barostat, state, workspace):
-    """Change the velocities with the strain, or not."""
+    """Change the velocities with the strain, unless the barostat keeps them."""
     raise TypeError("compiled code only")
 
 
@@ -409,7 +394,7 @@ def _rescale_velocities(barostat, state, workspace):
 
 @kernel
 def energy_gained(barostat, model, state, workspace):
-    """Change of potential and kinetic energy by the move (u Å²/ps²), dispersion beyond the cut-off included."""
+    """Change of potential and kinetic energy by the move (u Å²/ps²), with dispersion beyond the cutoff."""
     gained = workspace.tally[0, 0] - workspace.tally[1, 0]
     gained += barostat.tail[0] * (1 / volume_of(state.cell) - 1 / volume_of(workspace.cell))
     for m in range(len(state.velocity)):
@@ -419,15 +404,14 @@ def energy_gained(barostat, model, state, workspace):
     return gained
 
 
-@implements(log_chance)
-def _log_chance(barostat, model, state, workspace, h):
+@implements(log_acceptance)
+def _log_acceptance(barostat, model, state, workspace, h):
     if is_a(barostat, VolumeMoves):
 
         def of_volume(barostat, model, state, workspace, h):
             before, after = volume_of(workspace.cell), volume_of(state.cell)
-            work = energy_gained(barostat, model, state, workspace) + target_pressure(barostat.pressure, state, 0) * (
-                after - before
-            )
+            work = target_pressure(barostat.pressure, state, 0) * (after - before)
+            work = energy_gained(barostat, model, state, workspace) + work
             return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
 
         return of_volume

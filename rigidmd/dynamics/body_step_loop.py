@@ -1,4 +1,4 @@
-"""The flows of a single body. Each part is chosen by its type, so what a scene does not have is not compiled."""
+"""The flows of a single body. Each part is chosen by its type, so only what a scene has is compiled."""
 
 from typing import NamedTuple
 
@@ -21,9 +21,9 @@ from rigidmd.mechanics.translation import (
 
 
 class Body(NamedTuple):
-    """What never changes during a run of a single body, in SI units; the counterpart of `Model` for molecules."""
+    """The constant part of a single body, in SI units; the counterpart of `Model` for molecules."""
 
-    flight: FreeTranslation | NoTranslation | FluidTranslation
+    translation: FreeTranslation | NoTranslation | FluidTranslation
     rotor: SplitRotor | ExactRotor | DrivenRotor | NoRotor
     frame: InertialFrame | RotatingFrame = InertialFrame()
     resistance: NoResistance | Resistance = NoResistance()
@@ -31,14 +31,14 @@ class Body(NamedTuple):
 
 @implements(kick, Body, inline=True)
 def _kick_body(model, code, state, load, pending, h):
-    kick_with_resistance(model.resistance, model.flight, model.rotor, model.frame, state, load, h)
+    kick_with_resistance(model.resistance, model.translation, model.rotor, model.frame, state, load, h)
     return pending
 
 
 @implements(drift, Body, inline=True)
 def _drift_body(model, code, state, load, pending, h):
     time = state.time[NOW]
-    translate(model.flight, model.rotor, state, time, h)
+    translate(model.translation, model.rotor, state, time, h)
     rotate_with_frame(model.frame, state, time, h)
 
 
@@ -46,7 +46,7 @@ def _drift_body(model, code, state, load, pending, h):
 def _displace_body(model, state, load, tau):
     for k in range(len(load.force)):
         for i in range(3):
-            state.position[k, i] += tau / model.flight.mass * load.force[k, i]
+            state.position[k, i] += tau / model.translation.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
         n, time = load.torque_body[k], state.time[NOW]
         rotate_by_vector(
@@ -94,9 +94,9 @@ def relative_motion(model, state):
         velocity = (V[0], V[1], V[2])
         if len(state.rotation):
             q = state.rotation[0]
-            a = body_component(q, V, 0) * model.flight.mass / inertial_mass(model.flight, 0)
-            b = body_component(q, V, 1) * model.flight.mass / inertial_mass(model.flight, 1)
-            c = body_component(q, V, 2) * model.flight.mass / inertial_mass(model.flight, 2)
+            a = body_component(q, V, 0) * model.translation.mass / inertial_mass(model.translation, 0)
+            b = body_component(q, V, 1) * model.translation.mass / inertial_mass(model.translation, 1)
+            c = body_component(q, V, 2) * model.translation.mass / inertial_mass(model.translation, 2)
             velocity = (
                 q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
                 q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,

@@ -4,8 +4,8 @@ Such a kick has the potential U - (tau/2) [sum |F|²/m + sum n . I^-1 n] (Takaha
 
     F + tau (d F/d x) . a,    n_body + tau [(d n_body/d x) . a + (I^-1 n_body) x n_body]
 
-where a moves every body along its own F/m and rotates it along its own I^-1 n_body. The derivative along a is a
-difference of two force evaluations, so it works for every law, list and field. The second term of the torque arises
+where a moves each body along its F/m and rotates it along its I^-1 n_body. The derivative along a is a
+difference of two force evaluations, so it works for every potential and field. The second term of the torque arises
 because rotations do not commute: n_body is not a gradient with respect to coordinates.
 """
 
@@ -18,7 +18,7 @@ from rigidmd.core.state import OK, Load, State, no_load
 from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman & Touma 1996), the kick
-#: is not the gradient of a potential at order tau². With this fraction that defect is below the scheme's own error, and
+#: is not the gradient of a potential at order tau². With this fraction that error is below the error of the scheme, and
 #: rounding is still below 1e-13 of the force.
 FRACTION = 1 / 256
 
@@ -32,7 +32,6 @@ class GradientWorkspace(NamedTuple):
 
 
 def gradient_workspace(state: State) -> GradientWorkspace:
-    """A probe for the bodies of a state."""
     return GradientWorkspace(np.empty_like(state.position), np.empty_like(state.rotation), no_load(state))
 
 
@@ -47,23 +46,21 @@ def add_gyration(model, load, tau, gain):
 
 
 @kernel
-def evaluate(model, state, load, terms, probe, tau, known):
-    """One evaluation of forces: the load, or if that is known, the addition of the gradient to it; a status code.
-
-    One function does both, because the forces take long to compile. The state is restored to the bit.
-    """
+def evaluate(model, state, load, terms, displaced, tau, known):
+    """One evaluation of forces: the load, or, if the load is known, the addition of the gradient to it; a status code.
+    One function does both, because the forces take long to compile. The state is restored bit for bit."""
     if known:
-        copy(state.position, probe.position)
-        copy(state.rotation, probe.rotation)
+        copy(state.position, displaced.position)
+        copy(state.rotation, displaced.rotation)
         displace(model, state, load, FRACTION * tau)
-    status = compute_load(terms, state, probe.load if known else load, INTO_OTHER_LOAD if known else FORCES_ONLY)
+    status = compute_load(terms, state, displaced.load if known else load, INTO_OTHER_LOAD if known else FORCES_ONLY)
     if known:
-        copy(probe.position, state.position)
-        copy(probe.rotation, state.rotation)
+        copy(displaced.position, state.position)
+        copy(displaced.rotation, state.rotation)
         if status == OK:
-            add_gyration(model, load, FRACTION * tau, probe.load)
-            extrapolate(load.force, probe.load.force)
-            extrapolate(load.torque_body, probe.load.torque_body)
+            add_gyration(model, load, FRACTION * tau, displaced.load)
+            extrapolate(load.force, displaced.load.force)
+            extrapolate(load.torque_body, displaced.load.torque_body)
     return status
 
 
@@ -76,6 +73,6 @@ def copy(source, target):
 
 @kernel
 def extrapolate(value, elsewhere):
-    """Extrapolate linearly from `value` through `elsewhere`, at FRACTION of the distance, to the whole; in place."""
+    """Extrapolate from `value` through `elsewhere`, at FRACTION of the distance, to the full distance; in place."""
     for n, there in enumerate(elsewhere.flat):
         value.flat[n] += (there - value.flat[n]) / FRACTION

@@ -12,8 +12,8 @@ class Model(NamedTuple):
 
     species: np.ndarray  # (n,) species of each molecule
     mass: np.ndarray  # (species,) u
-    inverse_mass: np.ndarray  # (species,) 0 of what is frozen: nothing moves it
-    inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 where there is no rotation
+    inverse_mass: np.ndarray  # (species,) 1/u; 0 for a frozen species
+    inertia: np.ndarray  # (species, 3) principal moments, u Å²; 0 about an axis without inertia
     inverse_inertia: np.ndarray  # (species, 3); 0 where the moment is 0
     rotor: SplitRotor | ExactRotor | NoRotor
-    keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) components of the total momentum that nothing changes
+    keeps_momentum: np.ndarray = np.ones(3, bool)  # (3,) whether each component of the total momentum is conserved

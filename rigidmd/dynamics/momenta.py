@@ -21,7 +21,6 @@ class DegreesOfFreedom(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Of translation and rotation."""
         return self.translation + self.rotation
 
 
@@ -33,11 +32,8 @@ def count_degrees_of_freedom(model: Model) -> DegreesOfFreedom:
 
 
 def conserved_momentum(model: Model, terms: Mapping[str, NamedTuple]) -> np.ndarray:
-    """Which components (3,) of the total momentum are conserved: none among frozen molecules, which hold the others;
-    else those that no term says to change (`changes_momentum`).
-
-    `Model.keeps_momentum` is this, and what counts degrees of freedom and takes momentum out goes by it.
-    """
+    """Whether each component (3,) of the total momentum is conserved, as in `Model.keeps_momentum`. None is conserved
+    if there are frozen molecules. `changes_momentum` of a term lists the components that it changes."""
     kept = np.full(3, bool(mobile(model).all()))
     for term in terms.values():
         kept &= ~getattr(term, "changes_momentum", np.zeros(3, bool))
@@ -50,10 +46,8 @@ def mobile(model: Model) -> np.ndarray:
 
 
 def remove_momentum(model: Model, velocity: np.ndarray) -> float:
-    """Give every molecule the same push so that what is conserved of the total momentum is zero, in place.
-
-    Returns the kinetic energy that this takes, u Å²/ps²; 0 if the momentum was zero already.
-    """
+    """Subtract one velocity from all molecules, in place, so that conserved components of the total momentum are zero.
+    Returns the kinetic energy that this removes, u Å²/ps²; 0 if the momentum was zero already."""
     mass = model.mass[model.species]
     each = mass[:, None] * velocity
     momentum = np.where(model.keeps_momentum, each.sum(axis=0), 0.0)
@@ -64,8 +58,8 @@ def remove_momentum(model: Model, velocity: np.ndarray) -> float:
 
 
 def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.Generator) -> None:
-    """Maxwell-Boltzmann momenta, in place: zero total momentum as far as it is conserved; T_trans and T_rot exactly
-    `temperature` (K)."""
+    """Draw Maxwell-Boltzmann momenta, in place, and scale them to exactly `temperature` (K), T_trans and T_rot. The
+    conserved components of the total momentum are zero."""
     thermal = BOLTZMANN * temperature
     mass = model.mass[model.species]
     freedom = count_degrees_of_freedom(model)
@@ -73,9 +67,8 @@ def draw_momenta(model: Model, state: State, temperature: float, rng: np.random.
     state.velocity[:] = rng.standard_normal(state.velocity.shape) * spread[:, None]
     remove_momentum(model, state.velocity)
     kinetic = 0.5 * mass @ (state.velocity**2).sum(axis=1)
-    state.velocity[:] *= (
-        np.sqrt(0.5 * freedom.translation * thermal / kinetic) if kinetic > 0 and freedom.translation else 0.0
-    )
+    scales = kinetic > 0 and freedom.translation
+    state.velocity[:] *= np.sqrt(0.5 * freedom.translation * thermal / kinetic) if scales else 0.0
     if len(state.angular_momentum_body):
         spread = np.sqrt(thermal * model.inertia[model.species])
         state.angular_momentum_body[:] = rng.standard_normal(spread.shape) * spread

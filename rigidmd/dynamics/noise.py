@@ -1,7 +1,7 @@
 """Counter-based random numbers: Philox4x32-10 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC '11).
 
-A number is a function of a key and a counter, so there is no generator and no state to save, and the numbers are the
-same for any number of threads. The key depends on (seed, purpose, stage); the counter is (draw, molecule, step).
+A number is a function of a key and a counter. No state has to be saved, and the numbers are the same for any number
+of threads. The key depends on (seed, purpose, stage); the counter is (draw, molecule, step).
 """
 
 from math import cos, log, pi, sin, sqrt
@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.compile import kernel
 from rigidmd.compile.simd import lanes_of, load, store
 
-#: Purposes. Each has its own stream, so that an additional draw for one changes nothing for the others.
+#: Purposes. Each has a stream of random numbers, so that an additional draw for one changes nothing for the others.
 LATTICE, MOMENTA, THERMOSTAT, BAROSTAT = 1, 2, 3, 4
 
 MULTIPLIER_0, MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
@@ -31,17 +31,15 @@ class Key(NamedTuple):
 
 
 def key_of(seed: int, purpose: int, stage: int = 0) -> Key:
-    """The key of a purpose (LATTICE, MOMENTA, BATH) in a stage. It is well mixed, so seeds may be 1, 2, 3."""
+    """The key of a purpose (LATTICE, MOMENTA, ...) in a stage. It is well mixed, so seeds may be 1, 2, 3."""
     low, high = np.random.SeedSequence([seed, purpose, stage]).generate_state(2, np.uint32)
     return Key(np.uint64(low), np.uint64(high))
 
 
-@kernel(outer=True, inline=True)
+@kernel(from_python=True, inline=True)
 def philox(key, draw, molecule, step):
-    """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63.
-
-    It is inlined, since the loop of `fill_words` is vectorised only then.
-    """
+    """Four 32-bit numbers, as uint64, for a counter with draw and molecule below 2^32, step below 2^63. It is inlined,
+    since the loop of `fill_words` is vectorised only then."""
     a, b = np.uint64(draw) & LOW, np.uint64(molecule) & LOW
     c, d = np.uint64(step) & LOW, np.uint64(step) >> HALF
     low, high = key.low, key.high
@@ -52,14 +50,14 @@ def philox(key, draw, molecule, step):
     return a, b, c, d
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def uniforms(key, draw, molecule, step):
     """Two independent uniform numbers in (0, 1], from 64 bits each: never 0, and 1 only by rounding."""
     a, b, c, d = philox(key, draw, molecule, step)
     return ((a + 0.5) * WHOLE + b) * WHOLE, ((c + 0.5) * WHOLE + d) * WHOLE
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def normals(key, draw, molecule, step):
     """Two independent normal numbers of mean 0 and variance 1 (Box & Muller 1958)."""
     u, v = uniforms(key, draw, molecule, step)
@@ -67,12 +65,10 @@ def normals(key, draw, molecule, step):
     return radius * cos(2 * pi * v), radius * sin(2 * pi * v)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def chi_square(key, draw, molecule, step, freedom):
-    """The sum of squares of `freedom` normal numbers, from draws `draw`, draw + 1, ... (Marsaglia & Tsang 2000).
-
-    It is twice a Gamma variate of shape freedom/2; for a shape below 1, from one of shape + 1 (their section 6).
-    """
+    """The sum of squares of `freedom` normal numbers, from draws `draw`, draw + 1, ... (Marsaglia & Tsang 2000). It is
+    twice a Gamma variate of shape freedom/2; for a shape below 1, from one of shape + 1 (their section 6)."""
     if freedom == 0:
         return 0.0
     shape = 0.5 * freedom
@@ -107,10 +103,8 @@ def fill_words(words, key, draw, first, step):
 @kernel
 def fill_normals(found, words, key, draw, first, step):
     """Six normal numbers of each of BATCH molecules, from `first` on: two draws (Box & Muller 1958, with vectors).
-
-    Number k of molecule first + m goes to found[BATCH k + m]. words (2, 4, BATCH): room. Each radius is of 53 bits, so
-    that numbers go up to 8.6, each angle of 32.
-    """
+    Number k of molecule first + m goes to found[BATCH k + m]. words : scratch (2, 4, BATCH). Each radius has 53 random
+    bits, so that numbers go up to 8.6, and each angle 32."""
     fill_words(words[0], key, draw, first, step)
     fill_words(words[1], key, draw + 1, first, step)
     _fill_pairs(found, words.reshape(-1))

@@ -1,5 +1,4 @@
-"""Sums over the molecules of a state and its largest numbers, for a look at a run: one pass over each array, where
-NumPy takes a dozen with arrays between."""
+"""Sums over the molecules of a state, and its largest values: one pass over each array, for observations of a run."""
 
 from typing import NamedTuple
 
@@ -22,12 +21,12 @@ class StateSums(NamedTuple):
     orthogonality_error: float  # largest entry of |Q^T Q - 1|; NaN if one is
 
 
-#: How many numbers there are in `StateSums`.
+#: Number of the numbers in `StateSums`.
 SUM_COUNT = 17
 
 
 class LargestValues(NamedTuple):
-    """The largest size of a number in each array of a state and a load; NaN if one is, 0 of an empty array."""
+    """The largest absolute value in each array of a state and a load; NaN if one is NaN, 0 for an empty array."""
 
     position: float
     velocity: float
@@ -37,21 +36,20 @@ class LargestValues(NamedTuple):
     torque: float
 
 
-#: All bits of a float64 but its sign. As integers the rest are in the order of sizes, NaN after infinity.
+#: All bits of a float64 but its sign. Read as integers they are in the order of absolute values, NaN after infinity.
 SIZE = np.int64(2**63 - 1)
 
 
 def largest_values(state: State, load: Load = EXAMPLE[1]) -> LargestValues:
-    """The extent of a state and of the load on it."""
     found = np.empty(len(LargestValues._fields))
     arrays = (state.position, state.velocity, state.rotation, state.angular_momentum_body, *load)
     find_largest(*(array.ravel() for array in arrays), found)
     return LargestValues(*found.tolist())
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def find_largest(position, velocity, rotation, angular, force, torque, found):
-    """Fill in the numbers (6,) of an `LargestValues` of arrays as rows of numbers."""
+    """Write the numbers (6,) of `LargestValues` into `found`; the arrays are one-dimensional."""
     bits = found.view(np.int64)
     bits[0], bits[1], bits[2] = _largest(position), _largest(velocity), _largest(rotation)
     bits[3], bits[4], bits[5] = _largest(angular), _largest(force), _largest(torque)
@@ -59,8 +57,7 @@ def find_largest(position, velocity, rotation, angular, force, torque, found):
 
 @kernel
 def _largest(values):
-    """The bits of the largest size. Integers are compared several at a time; floats, of which NaN has no order, one by
-    one."""
+    """The bits of the largest absolute value. Comparisons of integers are vectorised, of floats with NaN not."""
     bits = values.view(np.int64)
     most = np.int64(0)
     for k in range(len(bits)):
@@ -69,25 +66,25 @@ def _largest(values):
 
 
 def sums_of_state(model: Model, state: State, load: Load = EXAMPLE[1]) -> StateSums:
-    """The sums of a state and of the load on it; without a load `force` and `torque` are 0."""
+    """Sums over a state and the load on it; without a load `force` and `torque` are 0."""
     found = np.zeros(SUM_COUNT)
     fill_sums(
         model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
-        state.angular_momentum_body, load.force, load.torque_body, found,
+        state.angular_momentum_body, load.force, load.torque_body, found
     )  # fmt: skip
     return unpack_sums(found)
 
 
 def unpack_sums(found: np.ndarray) -> StateSums:
-    """The sums in the numbers that `fill_sums` has filled in."""
+    """The sums from the numbers of `fill_sums`."""
     translation, rotation, force, torque, orthogonality_error = found[:5].tolist()
     vectors = found[5:].copy()
     return StateSums(translation, rotation, force, torque, vectors[:3], vectors[3:].reshape(3, 3), orthogonality_error)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def fill_sums(species, mass, inverse_mass, inverse_inertia, velocity, rotation, angular, force, torque, found):
-    """Fill in the numbers (SUMS,) of `StateSums`: orthogonality is the fifth, then come momentum and flow."""
+    """Write the numbers (SUM_COUNT,) of `StateSums`; orthogonality is the fifth, then come momentum and flow."""
     px = py = pz = xx = yy = zz = xy = xz = yz = turning = pushed = twisted = worst = 0.0
     for m in range(len(velocity)):
         m_i = mass[species[m]]

@@ -1,4 +1,4 @@
-"""The compiled loop: n steps of any row of flows, any terms, any thermostat, any barostat."""
+"""The compiled loop over steps, for any sequence of flows, any force terms, any thermostat and any barostat."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ import numpy as np
 from rigidmd.compile import BoundTask, Code, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, SCALE_BOX, THERMOSTAT, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
-from rigidmd.dynamics.barostats import apply_barostat, compute_load_for_barostat, scale_box
+from rigidmd.dynamics.barostats import apply_barostat, compute_step_load, scale_box
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
@@ -19,9 +19,9 @@ from rigidmd.mechanics.free_rotor import rotate_by_vector
 
 #: Random numbers that a flow may draw for one molecule in a step.
 DRAWS = 1 << 20
-#: Times of two kicks, 0 of one that there is not: kicks by the present load that are still to be done.
+#: The times of two pending kicks by the present load; 0 stands for no kick.
 NO_PENDING_KICKS = (0.0, 0.0)
-#: Molecules that are kicked, moved and turned before the next ones: so many that a core keeps them at hand.
+#: Number of molecules that are kicked, moved and rotated together: few enough to stay in a core's cache.
 CACHE_GROUP = 32 * LANES
 
 
@@ -31,20 +31,19 @@ def molecule_code(model: NamedTuple, thermostat: tuple) -> Code | None:
         return None
     state, load = EXAMPLE
     bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
-    return Code(
-        move=(_move, (*bodies, state, load, NO_PENDING_KICKS, 0.0, False)), **thermostat_code(thermostat, model)
-    )
+    move = (_move, (*bodies, state, load, NO_PENDING_KICKS, 0.0, False))
+    return Code(move=move, **thermostat_code(thermostat, model))
 
 
 class FlowArrays(NamedTuple):
     """The flows of a scheme as arrays, in their order."""
 
-    kind: np.ndarray  # (flows,) KICK, DRIFT, BATH, REST, BOX or STRETCH
+    kind: np.ndarray  # (flows,) KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT or SCALE_BOX
     fraction: np.ndarray  # (flows,) of the time step
-    moment: np.ndarray  # (flows,) of the time step: when each ends, as drifts count
-    every: np.ndarray  # (flows,) taken in every so many steps of a stretch
-    gradient: np.ndarray | None  # (flows,) of dt²; None where no kick has one, and none is compiled
-    last: int  # the last drift
+    moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
+    every: np.ndarray  # (flows,) the interval in steps at which the flow acts
+    gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
+    last: int  # index of the last drift
 
 
 def flow_arrays(scheme: Scheme) -> FlowArrays:
@@ -61,36 +60,22 @@ def flow_arrays(scheme: Scheme) -> FlowArrays:
 
 @kernel
 def advance(
-    model,
-    code,
-    state,
-    load,
-    terms,
-    thermostat,
-    barostat,
-    flows,
-    gradient_workspace,
-    thermostat_workspace,
-    barostat_workspace,
-    dt,
-    until,
-    observed,
-    progress,
-):
-    """Step until `until` steps of dt have been taken, counted in state.step.
+    model, code, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
+    barostat_workspace, dt, until, observed, progress
+):  # fmt: skip
+    """Take steps of dt until state.step is `until`. Returns a status code.
 
     code : see `molecule_code`
-    terms : of a body its workspaces, of molecules a `TermTable`
-    probe : room for gradients; None compiles none
-    thermostat_workspace, barostat_workspace : of a thermostat, of a box (`baths.thermostat_workspace`, `boxes.barostat_workspace`)
-    looked : whether the forces at the end are computed with their energies and virials, if a kick needs them there
-    cursor (3,) : flows done in this step; whether `load` is that of the present positions (1) or that with the gradient
-        (2); whether a move of the box is made and not yet judged
+    terms : the workspaces of a body, or the `TermTable` of molecules
+    flows : see `FlowArrays`. gradient_workspace : None compiles no kicks with gradients
+    observed : whether energies and virials are computed with the last forces, if a kick needs these
+    progress (3,) : flows done in this step; whether `load` belongs to the present positions (1), with the gradient
+        added (2); whether a barostat move has been made and is not yet accepted or rejected
 
-    Forces are evaluated before a kick where positions have changed since, so the last evaluation of a step serves the
-    next one. Kicks of molecules wait for the drift that follows, which does them on its way: the last of a step and the
-    first of the next are done in one pass with the drift. A status code: when it is not OK, state and cursor are such
-    that calling again continues without a trace.
+    Forces are evaluated before a kick if positions have changed since, so the last evaluation of a step serves the next
+    step. Kicks of molecules are pending until the next drift: the last kick of a step and the first of the next are
+    done in one pass with the drift. If the status is not OK, state and progress are such that another call continues
+    exactly where this one stopped.
     """
     pending = NO_PENDING_KICKS
     while state.step[NOW] < until:
@@ -101,24 +86,16 @@ def advance(
                 if gradient_workspace is None:
                     if progress[1] == 0:
                         last = observed and state.step[NOW] + 1 == until and k > flows.last
-                        status = compute_load_for_barostat(
-                            barostat,
-                            terms,
-                            state,
-                            load,
-                            barostat_workspace,
-                            flows,
-                            WITH_ENERGIES if last else FORCES_ONLY,
-                        )
+                        which = WITH_ENERGIES if last else FORCES_ONLY
+                        status = compute_step_load(barostat, terms, state, load, barostat_workspace, flows, which)
                         if status != OK:
                             return status
                         progress[1] = 1
                 else:
                     while progress[1] < (1 if flows.gradient[k] == 0.0 else 2):
                         pending = apply_pending_kicks(model, code, state, load, pending)
-                        status = evaluate(
-                            model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, progress[1] == 1
-                        )
+                        tau, known = flows.gradient[k] * dt * dt, progress[1] == 1
+                        status = evaluate(model, state, load, terms, gradient_workspace, tau, known)
                         if status != OK:
                             return status
                         progress[1] += 1
@@ -152,15 +129,13 @@ def advance(
     return OK
 
 
-#: Numbers of `Advance`: what a call is told (`until`, `observed`), its status, and the three of the cursor.
+#: Indices of `Advance._integers`: `until` and `observed` of `advance`, its status, and the three numbers of `progress`.
 UNTIL, OBSERVED, STATUS, PROGRESS = 0, 1, 2, 3
 
 
 class Advance:
-    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `observed` and the cursor.
-
-    At the end it measures the state and its load while the cores still have them at hand.
-    """
+    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `observed` and `progress`. At
+    the end it also sums over the state and its load, while these are in the caches of the cores."""
 
     def __init__(self, *arguments):
         self._dt, self._integers = np.zeros(1), np.zeros(PROGRESS + 3, np.int64)
@@ -168,130 +143,89 @@ class Advance:
         self._call = BoundTask(_advance, (arguments, self._dt, self._integers, self._extent, self._sums))
 
     def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
-        """Say what the next calls do. loaded : whether the load is that of the present positions"""
+        """Set what the next calls do. loaded : whether the load belongs to the present positions"""
         self._dt[0] = dt
         self._integers[:] = until, observed, OK, 0, loaded, 0
 
     def __call__(self) -> int:
-        """Go on; a status code."""
+        """Start or continue; a status code."""
         self._call()
         return int(self._integers[STATUS])
 
     @property
     def loaded(self) -> bool:
-        """Whether the load is that of the present positions."""
+        """Whether the load belongs to the present positions."""
         return self._integers[PROGRESS + 1] != 0
 
     @property
     def extent(self) -> LargestValues:
-        """That of the state, and of the load as last computed."""
+        """The largest values of the state, and of the load as last computed."""
         return LargestValues(*self._extent.tolist())
 
     @property
     def sums(self) -> StateSums | None:
-        """The sums over the state and its load; None if the last call was not to be looked at."""
+        """The sums over the state and its load; None if the last call was not `observed`."""
         return unpack_sums(self._sums) if self._integers[OBSERVED] else None
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def advance_body(
-    model,
-    state,
-    load,
-    terms,
-    thermostat,
-    barostat,
-    flows,
-    gradient_workspace,
-    thermostat_workspace,
-    barostat_workspace,
-    dt,
-    until,
-    observed,
-    progress,
-):
+    model, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
+    barostat_workspace, dt, until, observed, progress
+):  # fmt: skip
     """`advance` of a body, for Python."""
     return advance(
-        model,
-        None,
-        state,
-        load,
-        terms,
-        thermostat,
-        barostat,
-        flows,
-        gradient_workspace,
-        thermostat_workspace,
-        barostat_workspace,
-        dt,
-        until,
-        observed,
-        progress,
-    )
+        model, None, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
+        barostat_workspace, dt, until, observed, progress
+    )  # fmt: skip
 
 
 @task()
 def _advance(arguments, block):
-    (
-        (
-            model,
-            code,
-            state,
-            load,
-            terms,
-            thermostat,
-            barostat,
-            flows,
-            gradient_workspace,
-            thermostat_workspace,
-            barostat_workspace,
-        ),
-        dt,
-        integers,
-        extent,
-        sums,
-    ) = load_arguments(arguments)
+    bound, dt, integers, extent, sums = load_arguments(arguments)
+    model, code, state, load, terms, thermostat, barostat, flows, of_gradient, of_thermostat, of_barostat = bound
     integers[STATUS] = advance(
-        model, code, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace, barostat_workspace, dt[0], integers[UNTIL], integers[OBSERVED] != 0,
-        integers[PROGRESS:],
+        model, code, state, load, terms, thermostat, barostat, flows, of_gradient, of_thermostat, of_barostat,
+        dt[0], integers[UNTIL], integers[OBSERVED] != 0, integers[PROGRESS:]
     )  # fmt: skip
     if integers[STATUS] == OK:
         find_largest(
             state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
-            state.angular_momentum_body.ravel(), load.force.ravel(), load.torque_body.ravel(), extent,
+            state.angular_momentum_body.ravel(), load.force.ravel(), load.torque_body.ravel(), extent
         )  # fmt: skip
         if integers[OBSERVED] != 0:
             fill_sums(
                 model.species, model.mass, model.inverse_mass, model.inverse_inertia, state.velocity, state.rotation,
-                state.angular_momentum_body, load.force, load.torque_body, sums,
+                state.angular_momentum_body, load.force, load.torque_body, sums
             )  # fmt: skip
 
 
 def kick(model, code, state, load, pending, h):
-    """Exact flow of the potential, in place: V += h F/m, L += h n_body. Returns the kicks that wait: of molecules, with
-    those that have waited before, the kick itself; a body is kicked at once."""
+    """Exact flow of the potential, in place: V += h F/m, L += h n_body. Returns the pending kicks. A body is kicked at
+    once. The kick of a molecule is added to the pending kicks."""
     raise TypeError("compiled code only")
 
 
 def drift(model, code, state, load, pending, h):
-    """The kicks that wait, and the flow of the kinetic energy, in place: free flight and free rotation."""
+    """The pending kicks, then the flow of the kinetic energy, in place: free flight and free rotation."""
     raise TypeError("compiled code only")
 
 
 def apply_pending_kicks(model, code, state, load, pending):
-    """Do the kicks that wait, in place; returns that none waits."""
+    """Do the pending kicks, in place. Returns NO_PENDING_KICKS."""
     raise TypeError("compiled code only")
 
 
 def accumulate_work(model, terms, state, h):
-    """Add to the books what driving terms do over h; half before a kick, half after. On a body by their power at the
-    present velocity; on molecules by the rate at which their energy changes where nothing moves."""
+    """Add the work of time-dependent terms over h to the energy ledger; half before a kick, half after it. The work on
+    a body is the power of its terms at the present velocity. The work on molecules is the rate at which their potential
+    energy changes at fixed positions."""
     raise TypeError("compiled code only")
 
 
 def remove_momentum_flow(model, state):
-    """Take out the components of the total momentum that nothing changes, in place: the same velocity from all
-    molecules; its energy goes into the books."""
+    """Remove the conserved components of the total momentum, in place: the same velocity from all molecules. The energy
+    that this removes is entered in the energy ledger."""
     raise TypeError("compiled code only")
 
 
@@ -303,11 +237,11 @@ def _remove_momentum_of_molecules(model, state):
     def remove_momentum_of_molecules(model, state):
         mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
         for m in range(len(state.velocity)):
-            own = model.mass[model.species[m]]
-            mass += own
-            px += own * state.velocity[m, 0]
-            py += own * state.velocity[m, 1]
-            pz += own * state.velocity[m, 2]
+            m_i = model.mass[model.species[m]]
+            mass += m_i
+            px += m_i * state.velocity[m, 0]
+            py += m_i * state.velocity[m, 1]
+            pz += m_i * state.velocity[m, 2]
         kept = model.keeps_momentum
         px, py, pz = kept[0] * px, kept[1] * py, kept[2] * pz
         for m in range(len(state.velocity)):
@@ -350,9 +284,9 @@ def _apply_pending_kicks(model, code, state, load, pending):
 @implements(displace, Model)
 def _displace_molecules(model, state, load, tau):
     for m in range(len(state.position)):
-        share = tau * model.inverse_mass[model.species[m]]
+        tau_per_mass = tau * model.inverse_mass[model.species[m]]
         for k in range(3):
-            state.position[m, k] += share * load.force[m, k]
+            state.position[m, k] += tau_per_mass * load.force[m, k]
     for m in range(len(state.rotation)):
         inverse, n = model.inverse_inertia[model.species[m]], load.torque_body[m]
         rotate_by_vector(state.rotation[m], tau * inverse[0] * n[0], tau * inverse[1] * n[1], tau * inverse[2] * n[2])
@@ -390,7 +324,7 @@ def _move_all(model, code, state, load, pending, h, drifts):
 
 @task()
 def _move(arguments, block):
-    """The kicks that wait; and then, if there is a drift, free flight and free rotation."""
+    """The pending kicks; then, if there is a drift, free flight and free rotation."""
     rotor, species, inverse_mass, inverse_inertia, state, load, pending, h, drifts = load_arguments(arguments)
     first, end = molecules_of_block(len(state.position), block, LANES)
     for start in range(first, end, CACHE_GROUP):

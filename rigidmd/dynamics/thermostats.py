@@ -1,8 +1,8 @@
-"""Baths: flows on the momenta that keep a temperature, chosen by type; NVE compiles none.
+"""Thermostats: flows on the momenta that keep a temperature, chosen by type; NVE compiles none.
 
-`apply_thermostat(thermostat, model, code, state, workspace, h, draw)` acts where the row of a step says. What a thermostat puts in is in
-`state.energy_ledger[HEAT]`, and what it evolves in `state.extra_variables`; its random numbers are counted by the step, from `draw` on,
-see `noise`.
+`apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is summed in
+`state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random numbers are counted by the
+step, from `draw` on (see `noise`).
 """
 
 from math import exp, expm1, inf, sqrt
@@ -19,51 +19,46 @@ from rigidmd.mechanics.batches import LANES, apply_langevin_group, kinetic_energ
 
 
 class Ramp(NamedTuple):
-    """From one value to another, evenly over the steps of a stretch; a constant where the two are equal."""
+    """A temperature or another number that changes linearly over the steps of a run segment."""
 
     first: float
     last: float
-    steps: float  # of the stretch
+    steps: float  # of the segment
 
 
 def constant_ramp(value: float) -> Ramp:
-    """The ramp that stays at a value."""
+    """A number that does not change."""
     return Ramp(value, value, 1.0)
 
 
 @kernel(inline=True)
 def ramp_value(ramp, state):
-    """The value of a ramp in the step that is being taken."""
+    """The value of a ramp in the present step."""
     return ramp.first + (ramp.last - ramp.first) * ((state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps)
 
 
 class NoThermostat(NamedTuple):
-    """NVE."""
-
     rate: float = 0.0
 
 
 class VelocityRescaling(NamedTuple):
     """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101).
 
-    All momenta, translational and rotational together, are scaled by one factor such that the kinetic energy follows
-    its own exactly solved stochastic equation; the canonical distribution is sampled, total momentum keeps its
-    direction, and the time scale of single molecules is hardly touched.
+    All momenta, translational and rotational, are scaled by one factor, so that the kinetic energy follows a stochastic
+    equation that is solved exactly. The canonical distribution is sampled. The total momentum keeps its direction, and
+    the dynamics of single molecules hardly changes.
     """
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
-    time_constant: float  # ps; if infinite it does nothing
+    time_constant: float  # ps; infinite: no effect
     degrees_of_freedom: int
     key: Key
 
 
 class Langevin(NamedTuple):
-    """Friction and noise on every momentum: the Ornstein-Uhlenbeck process, solved exactly.
-
-    p <- c p + sqrt(m kT (1 - c²)) xi with c = exp(-friction h), and the same for each component of the angular momentum
-    along an axis that has inertia (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). Total momentum
-    is not conserved.
-    """
+    """Friction and noise on every momentum: the Ornstein-Uhlenbeck process, solved exactly. p <- c p + sqrt(m kT (1 -
+    c²)) xi with c = exp(-friction h), and the same for each component of the angular momentum along an axis that has
+    inertia (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). Total momentum is not conserved."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     friction_translation: float  # 1/ps
@@ -72,10 +67,8 @@ class Langevin(NamedTuple):
 
 
 class Andersen(NamedTuple):
-    """Collisions with a gas (Andersen 1980, J. Chem. Phys. 72, 2384): now and then a molecule gets new momenta.
-
-    Each molecule is hit independently, after `time_constant` on average. Total momentum is not conserved.
-    """
+    """Random collisions with a gas (Andersen 1980, J. Chem. Phys. 72, 2384), after which a molecule has new momenta.
+    Each molecule collides independently, after `time_constant` on average. Total momentum is not conserved."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps
@@ -85,10 +78,11 @@ class Andersen(NamedTuple):
 class NoseHoover(NamedTuple):
     """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of `state.extra_variables`.
 
-    Each half is eta (links,), then d eta/dt (links,). With masses Q_1 = g kT tau²/(2 pi)² and Q_j = kT tau²/(2 pi)² the
-    kinetic energy of each swings with the period tau. Conserved: the energy of molecules and of both chains,
-    sum Q_j v_j²/2 + g kT eta_1 + kT sum of the other eta (Martyna, Tuckerman, Tobias & Klein 1996, Mol. Phys. 87,
-    1117); what a chain gains is what `energy_ledger[HEAT]` loses. A flow is solved by the factors of Suzuki and Yoshida.
+    Each half is eta (links,), then d eta/dt (links,). The masses are Q_1 = g kT tau²/(2 pi)² and Q_j = kT tau²/(2 pi)²,
+    so each kinetic energy oscillates with the period tau. The energy of molecules and both chains is conserved, with
+    sum Q_j v_j²/2 + g kT eta_1 + kT sum of the other eta for each chain (Martyna, Tuckerman, Tobias & Klein 1996, Mol.
+    Phys. 87, 1117). The energy that a chain gains is subtracted from `energy_ledger[HEAT]`. A flow is integrated with
+    the Suzuki-Yoshida factors.
     """
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
@@ -99,35 +93,30 @@ class NoseHoover(NamedTuple):
 
     @property
     def variables(self) -> int:
-        """Numbers in `state.extra_variables`."""
+        """How many numbers it has in `state.extra_variables`."""
         return 4 * self.links
 
 
 def thermostat_workspace() -> np.ndarray:
-    """Room (MOST_BLOCKS, 2) for energies of each block of molecules."""
+    """Array (MOST_BLOCKS, 2) for energies of each block of molecules."""
     return np.zeros((MOST_BLOCKS, 2))
 
 
 def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
-    """The tasks of a thermostat that act on molecules in blocks, see `compile.Code`; none of others."""
+    """The tasks of a thermostat that act on blocks of molecules, see `compile.Code`; empty if it has none."""
     state, workspace = EXAMPLE[0], thermostat_workspace()
     if isinstance(thermostat, Langevin | Andersen):
-        return {
-            "molecules": (
-                _apply_langevin if isinstance(thermostat, Langevin) else _apply_andersen,
-                (thermostat, model, state, workspace, 0.0, 0),
-            )
-        }
+        apply = _apply_langevin if isinstance(thermostat, Langevin) else _apply_andersen
+        return {"molecules": (apply, (thermostat, model, state, workspace, 0.0, 0))}
     if isinstance(thermostat, VelocityRescaling | NoseHoover):
-        return {
-            "kinetic_energies": (_compute_kinetic_energies, (model, state, workspace)),
-            "scale": (_scale, (state, 0.0, 0.0)),
-        }
+        energies = (_compute_kinetic_energies, (model, state, workspace))
+        return {"kinetic_energies": energies, "scale": (_scale, (state, 0.0, 0.0))}
     return {}
 
 
 def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
-    """The flow of a thermostat over a time h (ps), in place; `draw` is its first draw in this step; workspace: see `thermostat_workspace`."""
+    """The flow of a thermostat over a time h (ps), in place. draw : its first random draw in this step. workspace : see
+    `thermostat_workspace`"""
     raise TypeError("compiled code only")
 
 
@@ -145,12 +134,12 @@ def _apply_rescaling(thermostat, model, code, state, workspace, h, draw):
     freedom = thermostat.degrees_of_freedom
     if kinetic == 0.0 or freedom == 0:
         return
-    # eq. A7, with one Gaussian apart and the sum of the squares of the others at once
+    # eq. A7: one Gaussian, and the sum of the squares of the others as one number
     c = exp(-h / thermostat.time_constant)
-    share = 0.5 * ramp_value(thermostat.thermal_energy, state) * (1 - c) / kinetic
+    noise = 0.5 * ramp_value(thermostat.thermal_energy, state) * (1 - c) / kinetic
     gauss, _ = normals(thermostat.key, draw, 0, state.step[NOW])
     others = chi_square(thermostat.key, draw + 1, 0, state.step[NOW], freedom - 1)
-    scale2 = c + share * (gauss * gauss + others) + 2 * gauss * sqrt(c * share)
+    scale2 = c + noise * (gauss * gauss + others) + 2 * gauss * sqrt(c * noise)
     state.energy_ledger[HEAT] += (scale2 - 1) * kinetic
     scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
 
@@ -165,7 +154,7 @@ def _apply_by_molecule(thermostat, model, code, state, workspace, h, draw):
 
 @task()
 def _apply_langevin(arguments, block):
-    """Langevin's friction and noise for the molecules of a block; their heat into workspace[block, 0]."""
+    """Langevin friction and noise for the molecules of a block; the heat is written to workspace[block, 0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     align_stack()
     first, end = molecules_of_block(len(state.velocity), block, LANES)
@@ -183,7 +172,7 @@ def _apply_langevin(arguments, block):
 
 @task()
 def _apply_andersen(arguments, block):
-    """Andersen's collisions with the molecules of a block; their heat into workspace[block, 0]."""
+    """Andersen collisions with the molecules of a block; the heat is written to workspace[block, 0]."""
     thermostat, model, state, workspace, h, draw = load_arguments(arguments)
     velocity, momentum = state.velocity, state.angular_momentum_body
     first, end = molecules_of_block(len(velocity), block, LANES)
@@ -209,31 +198,29 @@ def _apply_andersen(arguments, block):
 
 
 @kernel
-def thermal_momenta(model, moving, turning):
-    """Sizes (species, 4) of the angular momenta along the axes of a body, and of a component of its velocity, at
-    thermal energies of both motions."""
+def thermal_momenta(model, translation, rotation):
+    """Thermal momenta (species, 4): sqrt(I kT) for the three axes of a body, sqrt(kT/m) for a velocity component.
+    translation, rotation : their thermal energies"""
     sizes = np.empty((len(model.mass), 4))
     for kind in range(len(model.mass)):
         for k in range(3):
-            sizes[kind, k] = sqrt(turning * model.inertia[kind, k])
-        sizes[kind, 3] = sqrt(moving * model.inverse_mass[kind])
+            sizes[kind, k] = sqrt(rotation * model.inertia[kind, k])
+        sizes[kind, 3] = sqrt(translation * model.inverse_mass[kind])
     return sizes
 
 
-#: Fractions of a flow of the chains, Suzuki & Yoshida.
+#: Suzuki-Yoshida factors: fractions of a flow of the chains.
 YOSHIDA = (1 / (2 - 2 ** (1 / 3)), 1 - 2 / (2 - 2 ** (1 / 3)), 1 / (2 - 2 ** (1 / 3)))
 
 
 @implements(apply_thermostat, NoseHoover)
 def _apply_nose_hoover(thermostat, model, code, state, workspace, h, draw):
     thermal = ramp_value(thermostat.thermal_energy, state)
-    half = 2 * thermostat.links
     moving, turning = kinetic_energies_of(model, code, state, workspace)
-    scale, heat = move_chain(
-        thermostat, state.extra_variables[:half], thermal, moving, thermostat.freedom_translation, h
-    )
+    variables, links = state.extra_variables, 2 * thermostat.links
+    scale, heat = move_chain(thermostat, variables[:links], thermal, moving, thermostat.freedom_translation, h)
     scale_turning, heat_turning = move_chain(
-        thermostat, state.extra_variables[half:], thermal, turning, thermostat.freedom_rotation, h
+        thermostat, variables[links:], thermal, turning, thermostat.freedom_rotation, h
     )
     scale_momenta(code, state, scale, scale_turning)
     state.energy_ledger[HEAT] += heat + heat_turning
@@ -241,15 +228,15 @@ def _apply_nose_hoover(thermostat, model, code, state, workspace, h, draw):
 
 @kernel
 def move_chain(thermostat, chain, thermal, kinetic, freedom, h):
-    """Move a chain over h, in place: by which factor momenta scale, and what the chain has lost (u Å²/ps²)."""
+    """Propagate a chain over h, in place. Returns the factor of the momenta and the energy lost (u Å²/ps²)."""
     if freedom == 0:
         return 1.0, 0.0
     links = thermostat.links
     eta, rate = chain[:links], chain[links:]
     before = chain_energy(thermostat, chain, thermal, freedom)
     scale = 1.0
-    for share in YOSHIDA:
-        d = share * h
+    for factor in YOSHIDA:
+        d = factor * h
         _kick_links(thermostat, rate, thermal, 2 * scale * scale * kinetic, freedom, d, links - 1, -1, -1)
         scale *= exp(-d * rate[0])
         for j in range(links):
@@ -260,7 +247,7 @@ def move_chain(thermostat, chain, thermal, kinetic, freedom, h):
 
 @kernel
 def _kick_links(thermostat, rate, thermal, twice_kinetic, freedom, d, first, end, by):
-    """Half a step of the rates of the links, from the last link to the first or back."""
+    """Half a step of the rates of the links, from link `first` to the one before `end`."""
     links = thermostat.links
     unit = thermal * (thermostat.period / (2 * np.pi)) ** 2
     for j in range(first, end, by):
@@ -285,7 +272,7 @@ def chain_energy(thermostat, chain, thermal, freedom):
     return total
 
 
-# Sums over all molecules on one thread: for boxes, and for thermostats of one's own, which have no tasks.
+# Sums over all molecules on one thread: for barostats, and for user thermostats, which have no tasks.
 
 
 @kernel
@@ -315,7 +302,7 @@ def _energies(model, state, first, end):
 
 @kernel
 def kinetic_energies_of(model, code, state, workspace):
-    """Translational and rotational kinetic energy of all molecules (u Å²/ps²), by blocks and in their order."""
+    """Translational and rotational kinetic energy of all molecules (u Å²/ps²), summed in the order of blocks."""
     blocks = blocks_of(len(state.velocity))
     call_blocks(code, "kinetic_energies", pack_arguments((model, state, workspace)), blocks)
     moving = turning = 0.0
@@ -327,7 +314,7 @@ def kinetic_energies_of(model, code, state, workspace):
 
 @kernel
 def scale_momenta(code, state, scale, scale_turning):
-    """Multiply velocities and angular momenta by a number each, in place."""
+    """Multiply velocities by `scale` and angular momenta by `scale_turning`, in place."""
     call_blocks(code, "scale", pack_arguments((state, scale, scale_turning)), blocks_of(len(state.velocity)))
 
 

@@ -1,4 +1,4 @@
-"""Forces and thermostats of users that are compiled into the loop."""
+"""User forces and thermostats that are compiled into the step loop."""
 
 import inspect
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from rigidmd.compile.kernels import compile_user_function
 from rigidmd.dynamics.thermostats import apply_thermostat
 from rigidmd.forces.terms import add_forces
 
-#: The classes that are forces and thermostats.
+#: The registered classes.
 FORCES: set[type] = set()
 THERMOSTATS: set[type] = set()
 
@@ -17,7 +17,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled_force(kind: type) -> Callable[[Function], Function]:
-    """Make a NamedTuple class a force that is compiled into the loop.
+    """Make a NamedTuple class a force that is compiled into the step loop.
 
     class Trap(NamedTuple):
         stiffness: float  # u/ps²
@@ -33,10 +33,10 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
     The function adds forces (lab frame, u Å/ps²) and torques (body frame, u Å²/ps²) to `load` and, unless `tally` is
     None, its energy (u Å²/ps², 100 of them are 1 kJ/mol) and molecular virial, sum of F (x) R in rows, to `tally`.
 
-    The class may say `changes_momentum`, three truth values: by default all are true, and false is right of forces
-    between molecules; and `tied_to_places = True` where the energy depends on places in the lab, which excludes a
-    barostat. It may hold numbers, arrays and tuples of them. If its numbers come from the system, give `Simulation` an
-    object with a method `term(system)` that makes it.
+    The class may have the attribute `changes_momentum`, three booleans: whether the force may change each component of
+    the total momentum (the default), so False for forces between molecules. `tied_to_places = True` means that the
+    energy depends on positions in the lab, which excludes a barostat. The class may hold numbers, arrays and tuples of
+    them. If its numbers come from the system, give `Simulation` an object with a method `term(system)` that makes it.
     """
     _check_class(kind)
 
@@ -61,11 +61,11 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     @rigidmd.compiled_thermostat(Berendsen)
     def rescale(thermostat, model, state, h, draw): ...
 
-    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the kinetic
-    energy that it puts in to `state.energy_ledger[0]`, so that energy less heat is conserved. It acts half before and half
+    The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the change of
+    the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is conserved. It acts half before and half
     after each step (`halved = False` in the class: all of it after the step); with integrator = "baoab" in its middle.
-    `draw` is for counted random numbers (`rigidmd.dynamics.noise`). `changes_momentum = True` in the class says that it
-    changes the total momentum.
+    `draw` is for counted random numbers (`rigidmd.dynamics.noise`). `changes_momentum = True` in the class means that
+    it changes the total momentum.
     """
     _check_class(kind)
 

@@ -1,10 +1,10 @@
-"""Terms and workspaces: what acts on the bodies, how it is computed, and the dispatch over them.
+"""Force terms and their workspaces, and the dispatch over them.
 
-A term is a frozen NamedTuple of numbers: it says what acts. A workspace is made from a term by one engine and belongs
-to it: the term's numbers and, if needed, lists, grids, sums and machine code. `add_forces(workspace, state, load,
-tally)` is chosen by the workspace's type at compile time; what a scene does not have is never compiled. To add a law,
-write one file with a NamedTuple and an `@implements(add_forces)` (or, for a law between pairs of sites, an
-`@implements(pairs.pair)`). A term that needs no workspace serves as its workspace.
+A term is a frozen NamedTuple of numbers that describes a force. A workspace is made from a term by one engine: the
+numbers of the term and, if needed, lists, grids, sums and machine code. A term that needs no workspace is used as its
+workspace. `add_forces(workspace, state, load, tally)` is chosen by the type of the workspace at compile time, so only
+what a scene has is compiled. A new force is one file with a NamedTuple and an `@implements(add_forces)`, a new pair
+potential one with an `@implements(pair_loop.pair)`.
 """
 
 from typing import NamedTuple
@@ -12,27 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from numba import literal_unroll, types
 
-from rigidmd.compile import (
-    Code,
-    NumbaStruct,
-    call_address,
-    implements,
-    is_a,
-    kernel,
-    load_arguments,
-    task,
-)
+from rigidmd.compile import Code, NumbaStruct, call_address, implements, is_a, kernel, load_arguments, task
 from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
 
 
 class Setup(NamedTuple):
     """What the workspaces of an engine depend on."""
 
-    cell: np.ndarray  # (3, 3) at the start; workspaces follow the cell of the state
+    cell: np.ndarray  # (3, 3) at the start; later the cell of the state is used
     dtype: type  # of the arithmetic between sites: numpy.float64 or numpy.float32
     skin: float  # extra radius of neighbour lists, Å
     with_energies: np.ndarray  # (1,) of the table
-    needs_virials: bool  # whether virials without energies will be asked for
+    needs_virials: bool  # whether virials will be needed without energies
 
 
 def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
@@ -46,40 +37,34 @@ def with_code(workspace: NamedTuple) -> NamedTuple:
 
 
 def with_capacity(workspace: NamedTuple, cell: np.ndarray) -> NamedTuple:
-    """The workspace with the room that it needed, for a cell (3, 3). May raise SimulationError."""
+    """The workspace with the capacity that it needed, for a cell (3, 3). May raise SimulationError."""
     return workspace.with_capacity(cell) if hasattr(workspace, "with_capacity") else workspace
 
 
 def with_common_scratch(workspaces: tuple[NamedTuple, ...]) -> tuple[NamedTuple, ...]:
-    """The workspaces with one array, the largest of theirs, for what each needs only while its forces are computed."""
-    passing = [workspace.scratch for workspace in workspaces if hasattr(workspace, "scratch")]
-    if not passing:
+    """The workspaces with one common scratch array, the largest of theirs, for use while forces are computed."""
+    arrays = [workspace.scratch for workspace in workspaces if hasattr(workspace, "scratch")]
+    if not arrays:
         return workspaces
-    largest = max(passing, key=np.size)
-    return tuple(
-        workspace.with_scratch(largest) if hasattr(workspace, "scratch") else workspace for workspace in workspaces
-    )
+    largest = max(arrays, key=np.size)
+    return tuple(w.with_scratch(largest) if hasattr(w, "scratch") else w for w in workspaces)
 
 
 def checkpoint_arrays(workspace: NamedTuple) -> dict[str, np.ndarray]:
-    """Arrays on which the next forces depend besides the state, for `restored`; none of most workspaces."""
+    """Arrays on which the next forces depend besides the state, for `restored`; most workspaces have none."""
     return workspace.checkpoint_arrays() if hasattr(workspace, "checkpoint_arrays") else {}
 
 
 def restored(workspace: NamedTuple, arrays: dict[str, np.ndarray], skin: float, now: float) -> NamedTuple:
-    """The workspace, which has machine code, with what `checkpoint_arrays` gave. Raises ValueError if that does not fit.
-
-    skin : of neighbour lists, as asked for, Å. now : the present time, ps
-    """
+    """The workspace, which has machine code, with its `checkpoint_arrays`. Raises ValueError if these do not fit. skin
+    : of neighbour lists, as requested, Å. now : the present time, ps"""
     if bool(arrays) != hasattr(workspace, "checkpoint_arrays"):
-        raise ValueError(
-            f"{type(workspace).__name__} {'lacks what it remembers' if not arrays else 'remembers nothing'}"
-        )
+        raise ValueError(f"{type(workspace).__name__} {'lacks' if not arrays else 'has no'} checkpoint arrays")
     return workspace.restore(arrays, skin, now) if arrays else workspace
 
 
 def add_forces(term, state, load, tally):
-    """Add a term's forces and torques to `load`, its energy and virial to `tally` unless None; a status code."""
+    """Add the forces and torques of a term to `load`, its energy and virial to `tally` unless None; a status code."""
     raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
 
 
@@ -96,10 +81,8 @@ def _worse_status(status, other):
 
 
 def power(term, state, velocity, omega):
-    """Power of a term whose class has `time_dependent = True`; 0 for any other term, because its energy includes its work.
-
-    velocity (lab axes) and omega (body axes) : tuples, relative to the frame
-    """
+    """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy includes its work.
+    velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
     raise TypeError("compiled code only")
 
 
@@ -110,7 +93,7 @@ def _no_power(term, state, velocity, omega):
 
 
 def energy_rate(term, state):
-    """dU/dt of a term of molecules whose class says `time_dependent = True` while nothing moves; 0 of any other."""
+    """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0 for any other."""
     raise TypeError("compiled code only")
 
 
@@ -121,7 +104,7 @@ def _no_energy_rate(term, state):
 
 
 class NoForce(NamedTuple):
-    """Replaces an empty tuple of terms, over which Numba cannot loop: free flight."""
+    """No forces; Numba cannot loop over an empty tuple of terms."""
 
     force: float = 0.0
 
@@ -131,31 +114,28 @@ def _add_no_force(term, state, load, tally):
     return OK
 
 
-#: What is asked of `compute_load`: forces; forces with energies and virials; forces into the other load; forces with
-#: virials, and with energies only where they cost nothing.
+#: What `compute_load` computes: forces; forces, energies and virials; forces into the other load; forces and virials,
+#: and energies only where these take no extra time.
 FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD, WITH_VIRIALS = 0, 1, 2, 3
 
 
 class TermTable(NamedTuple):
-    """Terms as addresses of machine code and of what it works on.
+    """Force terms as addresses of machine code and of its arguments. Each term is compiled once, for all scenes that
+    have it, and the step loop once for all terms of molecules. The table counts no references: see `TermDispatcher`."""
 
-    So each term is compiled once, for all scenes that have it, and the loop over steps once for all terms of molecules.
-    A table counts no references: see `TermDispatcher`.
-    """
-
-    force_address: np.ndarray  # (terms,) intp, of `_add_plain`; 0 of a body, whose terms are compiled into its loop
+    force_address: np.ndarray  # (terms,) intp, of `_add_plain`; 0 for a body, whose terms are compiled into the loop
     tally_address: np.ndarray  # (terms,) of `_add_tallied`
-    rate_address: np.ndarray | None  # (terms,) of `_add_rate`; None where no term drives
-    arguments_address: np.ndarray  # (terms,)
-    tallies: np.ndarray  # (terms, 10) energy and virial of each
-    with_energies: np.ndarray  # (1,) whether tallies have to have the energies
-    tallies_valid: np.ndarray  # (1,) whether `tallies` are those of the last forces
+    rate_address: np.ndarray | None  # (terms,) of `_add_rate`; None if no term is time-dependent
+    arguments_address: np.ndarray  # (terms,) of the packed arguments
+    tallies: np.ndarray  # (terms, 10) energies and virials
+    with_energies: np.ndarray  # (1,) whether energies are needed in `tallies`
+    tallies_valid: np.ndarray  # (1,) whether `tallies` belong to the last forces
     status: np.ndarray  # (1,) the worst status code
     power: np.ndarray  # (1,) sum of the rates
 
 
 def empty_term_table(terms: int, time_dependent: bool, with_energies: np.ndarray) -> TermTable:
-    """An empty table for so many terms."""
+    """A table without addresses."""
     plain, tallied, rate, content = np.zeros((4, terms), np.intp)
     known, status = np.zeros((2, 1), np.int64)
     tallies = np.zeros((terms, TALLY_SIZE))
@@ -164,7 +144,7 @@ def empty_term_table(terms: int, time_dependent: bool, with_energies: np.ndarray
 
 
 def term_code(term: NamedTuple, table: TermTable, called: bool) -> Code:
-    """The machine code of a term for a table. called : whether the loop over steps calls it by address."""
+    """The machine code of a term for a table. called : whether the step loop calls it by address."""
     content = (term, *EXAMPLE, EXAMPLE[1], table.tallies[0], table.status, table.power)
     tasks = {"tallied": (_add_tallied, content)}
     if called:
@@ -193,16 +173,14 @@ def _add_rate(arguments, block):
 
 
 class TermDispatcher:
-    """The terms of an engine behind their table; keeps alive what it refers to.
-
-    called : whether the loop over steps calls the terms by address. with_energies : that of the `Setup`
-    """
+    """The terms of an engine and their table; keeps alive what the table refers to. called : whether the step loop
+    calls the terms by address. with_energies : see `Setup`"""
 
     def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool, with_energies: np.ndarray):
         time_dependent = any(getattr(type(workspace), "time_dependent", False) for workspace in workspaces)
         self.table = empty_term_table(len(workspaces), called and time_dependent, with_energies)
         self._codes = [term_code(workspace, self.table, called) for workspace in workspaces]
-        self._laid: list[NumbaStruct] = []
+        self._structs: list[NumbaStruct] = []
         self._given: tuple = (None,) * 4
         self._kept: tuple = ()
         for k, code in enumerate(self._codes):
@@ -214,10 +192,8 @@ class TermDispatcher:
     def bind(
         self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None
     ) -> TermTable:
-        """The table of these workspaces, of the same types as the first, for a state and its loads.
-
-        Numba takes milliseconds to find the types of so many arrays; nothing is done where they are those of last time.
-        """
+        """The table, bound to workspaces (of the same types as the first), a state and its loads. Numba takes
+        milliseconds to determine the types of the arrays, so nothing is done if these are unchanged."""
         given = (workspaces, state, load, other)
         if all(now is then for now, then in zip(given, self._given, strict=True)):
             return self.table
@@ -226,40 +202,36 @@ class TermDispatcher:
             self._given = given
             return self.table
         table, loads = self.table, (load, other or load)
-        self._laid = [
-            code.lay_down((workspace, state, *loads, table.tallies[k], table.status, table.power))
+        self._structs = [
+            code.to_struct((workspace, state, *loads, table.tallies[k], table.status, table.power))
             for k, (workspace, code) in enumerate(zip(workspaces, self._codes, strict=True))
         ]
-        table.arguments_address[:] = [laid.address for laid in self._laid]
+        table.arguments_address[:] = [struct.address for struct in self._structs]
         self._given, self._kept = given, kept
         return self.table
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def compute_load_with_energies(table, force, torque_body):
-    """Write the forces and torques of all terms, and energies and virials in the table; a status code.
-
-    force, torque_body : the arrays of the load to which the table is bound
-    """
+    """Write forces and torques of all terms, and energies and virials into the table; a status code. force, torque_body
+    : the arrays of the load to which the table is bound"""
     return compute_load(table, None, Load(force, torque_body), WITH_ENERGIES)
 
 
 def has_time_dependent_terms(table: types.Type) -> bool:
-    """Whether the type of a table has the rates of terms that drive."""
+    """Whether the type of a table has addresses of the rates of time-dependent terms."""
     return is_a(table, TermTable) and table.types[TermTable._fields.index("rate_address")] is not types.none
 
 
 def compute_load(terms, state, load, which):
-    """Write the forces and torques of all terms at the present positions; the worst status code.
-
-    terms : a tuple of terms, or a `TermTable`. which : PLAIN, TALLIED, OTHER or PRESSED. A table knows its loads, and
-    `load` must be the one asked for; energies and virials go into its tallies. Of a tuple there are only forces.
-    """
+    """Write the forces and torques of all terms at the present positions; the worst status code. terms : a tuple of
+    terms, which gives forces only, or a `TermTable`, which gets energies and virials. which : FORCES_ONLY,
+    WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the load that it means."""
     raise TypeError("compiled code only")
 
 
 @implements(compute_load)
-def _load_now(terms, state, load, which):
+def _compute_load(terms, state, load, which):
     if not is_a(terms, TermTable):
         return lambda terms, state, load, which: compute_body_load(terms, state, load, None)
 
@@ -275,7 +247,7 @@ def _load_now(terms, state, load, which):
         for k in range(len(terms.arguments_address)):
             address = terms.tally_address[k] if tallied else terms.force_address[k]
             call_address(address, terms.arguments_address[k], which)
-            if terms.status[0] != OK:  # asked again, all terms begin again: no need to go on
+            if terms.status[0] != OK:  # the next call begins with the first term again
                 return terms.status[0]
         terms.tallies_valid[0] = which == WITH_ENERGIES
         return OK
@@ -285,7 +257,7 @@ def _load_now(terms, state, load, which):
 
 @kernel
 def clear(values):
-    """values[:] = 0 of an array (n, 3), as a loop, which compiles ten times faster."""
+    """values[:] = 0 for an array (n, 3), as a loop, which compiles ten times faster."""
     for m in range(len(values)):
         for k in range(3):
             values[m, k] = 0.0
@@ -293,10 +265,8 @@ def clear(values):
 
 @kernel(inline=True)
 def compute_body_load(terms, state, load, tally):
-    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code.
-
-    Energies and virials add up in `tally`; None compiles none.
-    """
+    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code. Energies and
+    virials are added to `tally`, or not compiled if it is None."""
     load.force[:] = 0.0
     load.torque_body[:] = 0.0
     status = OK

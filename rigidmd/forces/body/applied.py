@@ -1,4 +1,4 @@
-"""External forces on a single body: weight, buoyancy, and those that a scene or a Python function applies."""
+"""External forces on a single body: weight, buoyancy, forces from a scene, and forces from a Python function."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,43 +20,39 @@ class SteadyForce(NamedTuple):
 
 
 class TimeDependentForce(NamedTuple):
-    """A force at a point of the body and a torque, given functions of time, along the lab's or the body's axes."""
+    """A force at a point of the body and a torque, functions of time, along the axes of the lab or of the body."""
 
     force: TimeFunction
     torque: TimeFunction
     point: np.ndarray  # (3,) body
-    follows_body: bool  # force and torque are given along the body's axes
+    follows_body: bool  # whether force and torque are along the axes of the body
 
     def workspace(self, setup: Setup) -> "TimeDependentForceWorkspace":
-        """Room for its present values."""
         return TimeDependentForceWorkspace(*self, np.zeros(3), np.zeros(3))
 
 
 class TimeDependentForceWorkspace(NamedTuple):
-    """Workspace of a `TimeDependentForce`."""
-
     force: TimeFunction
     torque: TimeFunction
     point: np.ndarray
     follows_body: bool
     force_lab: np.ndarray  # (3,) as last evaluated
-    torque_body: np.ndarray  # (3,) as last evaluated, including that of the force
+    torque_body: np.ndarray  # (3,) as last evaluated, with the torque of the force
 
     time_dependent = True
 
 
 class PythonForce(NamedTuple):
-    """Force and torque from a Python function, which the engine holds."""
+    """Force and torque from a Python function, which the engine calls."""
 
     def workspace(self, setup: Setup) -> "PythonForceWorkspace":
-        """Room for the values."""
         return PythonForceWorkspace(np.zeros(1, np.int64), np.zeros(3), np.zeros(3))
 
 
 class PythonForceWorkspace(NamedTuple):
-    """Workspace of a `PythonForce`; it asks for new values whenever positions have changed."""
+    """Workspace of a `PythonForce`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions have changed."""
 
-    fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
+    fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
     force_lab: np.ndarray  # (3,)
     torque_body: np.ndarray  # (3,)
 
@@ -95,7 +91,7 @@ def steady_energy(term, position, rotation):
     return energy
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def steady_energies(term, position, rotation):
     """`steady_energy` at t times, (t,); position and rotation as in State, stacked along a new axis 0."""
     energy = np.empty(len(position))
@@ -144,7 +140,7 @@ def _add_python_force(term, state, load, tally):
 
 @kernel(inline=True)
 def add_to_load(term, load):
-    """Add a term's present force and torque to the load of the body."""
+    """Add the present force and torque of a term to the load of the body; returns OK."""
     for k in range(len(load.force)):
         for i in range(3):
             load.force[k, i] += term.force_lab[i]

@@ -1,8 +1,8 @@
-"""Non-inertial frames: motion relative to axes that rotate, about an origin that may be accelerated.
+"""Non-inertial frames: motion relative to axes that rotate about an origin, which may be accelerated.
 
-Momenta remain those relative to non-rotating axes, with components along the frame's axes. The frame then adds one
-flow, a rotation of position, velocity and Q; Coriolis, centrifugal and Euler forces follow without being computed. The
-acceleration of the origin is a uniform field.
+Momenta are those relative to non-rotating axes, in components along the axes of the frame. The frame then adds one
+flow, a rotation of position, velocity and Q, from which Coriolis, centrifugal and Euler forces follow. The acceleration
+of the origin is a uniform field.
 """
 
 from math import sqrt
@@ -20,13 +20,11 @@ class InertialFrame(NamedTuple):
 
 
 class RotatingFrame(NamedTuple):
-    """Axes that rotate. The flow is exact for a constant rate, and for one that changes linearly about a fixed axis.
+    """Axes that rotate. The flow is exact for a constant rate, and for one about a fixed axis that is linear in time.
+    Otherwise each drift is symmetric and of order 2: compositions of symmetric steps keep their order, other schemes
+    fall to order 2."""
 
-    Otherwise each drift is of order 2 and symmetric: compositions of symmetric steps keep their order, other schemes
-    fall to order 2.
-    """
-
-    angular_velocity: TimeFunction  # along the frame's own axes
+    angular_velocity: TimeFunction  # along the axes of the frame
 
 
 def rotate_with_frame(frame, state, time, h):
@@ -67,7 +65,7 @@ def rotate_in_place(vector, x, y, z):
 
 
 def frame_rate(frame, time):
-    """Angular velocity of the frame along its own axes, as a tuple."""
+    """Angular velocity of the frame along its axes, as a tuple."""
     raise TypeError("compiled code only")
 
 
@@ -77,10 +75,7 @@ def _frame_rate(frame, time):
         return lambda frame, time: (0.0, 0.0, 0.0)
 
     def rate(frame, time):
-        return (
-            value(frame.angular_velocity, time, 0),
-            value(frame.angular_velocity, time, 1),
-            value(frame.angular_velocity, time, 2),
-        )
+        omega = frame.angular_velocity
+        return value(omega, time, 0), value(omega, time, 1), value(omega, time, 2)
 
     return rate

@@ -1,8 +1,8 @@
-"""Resistance: bearings, air and fluids that take energy from a single body, along and about its own axes.
+"""Resistance: bearings, air and fluids that take energy from a single body, along and about its axes.
 
-It acts within the kick: with positions fixed, the momentum along each axis under a constant load and resistance has a
-closed form. So a body in a viscous fluid moves at its terminal speed for any step, and dry friction holds a body at
-rest as it should. The step is of order 2.
+It acts within the kick: at fixed positions, the momentum along each axis under a constant load and resistance has a
+closed form. So a body in a viscous fluid has its terminal speed for any step, and dry friction holds a body at rest.
+The step is of order 2.
 """
 
 from math import copysign, exp, expm1, log1p, sqrt
@@ -16,22 +16,18 @@ from rigidmd.forces.body.frame import frame_rate
 from rigidmd.mechanics.free_rotor import NoRotor, moments
 from rigidmd.mechanics.translation import NoTranslation, body_component, inertial_mass
 
-MAX_ITERATIONS = 100  # values of |v|; about six are needed
+MAX_ITERATIONS = 100  # for |v|; about six are needed
 SPEED_TOLERANCE = 1e-14  # relative error of |v|
 
 
 class NoResistance(NamedTuple):
-    """No resistance."""
-
     nothing: float = 0.0
 
 
 class Resistance(NamedTuple):
-    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for each body axis.
-
-    v and w are relative to the frame; |v| and |w| are the lengths of the vectors, so equal coefficients mean isotropic
-    resistance. Dry friction is that of a bearing about a body axis under constant load.
-    """
+    """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for each body axis. v and
+    w are relative to the frame; |v| and |w| are the lengths of the vectors, so equal coefficients mean isotropic
+    resistance. Dry friction is the friction of a bearing about a body axis under constant load."""
 
     linear: np.ndarray  # (3,)
     quadratic: np.ndarray  # (3,)
@@ -40,20 +36,20 @@ class Resistance(NamedTuple):
     rotation_quadratic: np.ndarray  # (3,)
 
 
-def kick_with_resistance(resistance, flight, rotor, frame, state, load, h):
+def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
     """Change the momenta of a single body by a load and resistance for a time h at fixed positions, in place."""
     raise TypeError("compiled code only")
 
 
 @implements(kick_with_resistance, inline=True)
-def _kick_with_resistance(resistance, flight, rotor, frame, state, load, h):
-    flies, turns = not is_a(flight, NoTranslation), not is_a(rotor, NoRotor)
+def _kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
+    flies, turns = not is_a(translation, NoTranslation), not is_a(rotor, NoRotor)
     if is_a(resistance, NoResistance):
 
-        def kick_freely(resistance, flight, rotor, frame, state, load, h):
+        def kick_freely(resistance, translation, rotor, frame, state, load, h):
             for m in range(len(load.force)):
                 for k in range(3):
-                    state.velocity[m, k] += h / flight.mass * load.force[m, k]
+                    state.velocity[m, k] += h / translation.mass * load.force[m, k]
             for m in range(len(load.torque_body)):
                 for k in range(3):
                     if moments(rotor, state.time[0], k)[0] > 0:  # an axis without inertia has no momentum
@@ -61,9 +57,9 @@ def _kick_with_resistance(resistance, flight, rotor, frame, state, load, h):
 
         return kick_freely
 
-    def kick_against_resistance(resistance, flight, rotor, frame, state, load, h):
+    def kick_against_resistance(resistance, translation, rotor, frame, state, load, h):
         if flies:
-            kick_translation(resistance, flight, rotor, frame, state, load, h)
+            kick_translation(resistance, translation, rotor, frame, state, load, h)
         if turns:
             kick_rotation(resistance, rotor, frame, state, load, h)
 
@@ -99,11 +95,9 @@ def kick_rotation(resistance, rotor, frame, state, load, h):
 
 @kernel
 def midpoint_speed(before, pushes, dries, inverse, linear, quadratic, h):
-    """|v| at the middle of a kick, consistent with the resistance that this |v| causes; all per unit inertia.
-
-    The computed |v| minus the assumed |v| changes sign between 0 and the largest |v| that the push can produce; regula
-    falsi (Illinois) finds the root. A single guess would brake a fast body to rest at the middle, or not at all.
-    """
+    """|v| at the middle of a kick with the resistance that this |v| causes; all arguments per unit inertia. The
+    computed |v| minus the assumed |v| changes sign between 0 and the largest |v| that the load can cause; regula falsi
+    (Illinois) finds the root. With a single guess a fast body would stop at the middle, or not be braked at all."""
     if quadratic[0] == 0.0 and quadratic[1] == 0.0 and quadratic[2] == 0.0:
         return 0.0
     low, high = 0.0, 0.0
@@ -143,26 +137,30 @@ def speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, 
     return sqrt(squares)
 
 
-def kick_translation(resistance, flight, rotor, frame, state, load, h):
-    """Change the velocity (or impulse over mass) by force and resistance; |v| is treated like |w| in `kick_rotation`."""
+def kick_translation(resistance, translation, rotor, frame, state, load, h):
+    """Change the velocity (or impulse over mass) by force and resistance; |v| is found like |w| in `kick_rotation`."""
     raise TypeError("compiled code only")
 
 
 @implements(kick_translation)
-def _kick_translation(resistance, flight, rotor, frame, state, load, h):
+def _kick_translation(resistance, translation, rotor, frame, state, load, h):
     turns = not is_a(rotor, NoRotor)
 
-    def kick_translation(resistance, flight, rotor, frame, state, load, h):
+    def kick_translation(resistance, translation, rotor, frame, state, load, h):
         W = frame_rate(frame, state.time[0])
         x = state.position[0]
         V = state.velocity[0]
         F = load.force[0]
         wind = (W[1] * x[2] - W[2] * x[1], W[2] * x[0] - W[0] * x[2], W[0] * x[1] - W[1] * x[0])
-        mass = (inertial_mass(flight, 0), inertial_mass(flight, 1), inertial_mass(flight, 2))
+        mass = (inertial_mass(translation, 0), inertial_mass(translation, 1), inertial_mass(translation, 2))
         inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
         if turns:
             q = state.rotation[0]
-            velocity_per_momentum = (flight.mass * inverse[0], flight.mass * inverse[1], flight.mass * inverse[2])
+            velocity_per_momentum = (
+                translation.mass * inverse[0],
+                translation.mass * inverse[1],
+                translation.mass * inverse[2],
+            )
             before = (
                 velocity_per_momentum[0] * body_component(q, V, 0) - body_component(q, wind, 0),
                 velocity_per_momentum[1] * body_component(q, V, 1) - body_component(q, wind, 1),
@@ -181,7 +179,7 @@ def _kick_translation(resistance, flight, rotor, frame, state, load, h):
         for k in range(3):
             after, flown = resisted_motion(before[k], pulls[k], 0.0, (linear[k] + quadratic[k] * size) * inverse[k], h)
             state.energy_ledger[WORK] += mass[k] * (0.5 * (after - before[k]) * (after + before[k]) - pulls[k] * flown)
-            gain = (after - before[k]) * mass[k] / flight.mass
+            gain = (after - before[k]) * mass[k] / translation.mass
             if turns:
                 for i in range(3):  # along axis k only, so that components along the other axes do not change
                     V[i] += state.rotation[0, i, k] * gain
@@ -193,10 +191,8 @@ def _kick_translation(resistance, flight, rotor, frame, state, load, h):
 
 @kernel
 def resisted_motion(speed, kick_with_resistance, dry, linear, h):
-    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0.
-
-    Dry friction brings the motion to rest in a finite time, and holds it at rest unless the push is stronger.
-    """
+    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0. Dry
+    friction stops the motion in a finite time, and holds the body at rest unless the push is stronger."""
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:
@@ -206,7 +202,7 @@ def resisted_motion(speed, kick_with_resistance, dry, linear, h):
     net = sign * kick_with_resistance - dry
     if net < 0.0:
         rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
-        if rest <= h:  # it stops, and the push may then reverse the motion
+        if rest <= h:  # the body stops, and the push may then reverse the motion
             back = max(0.0, abs(kick_with_resistance) - dry) if sign * kick_with_resistance < 0.0 else 0.0
             there = drag_integrals(linear, rest)
             after, way = linear_drag_motion(0.0, back, linear, h - rest)

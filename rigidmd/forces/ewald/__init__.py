@@ -1,1 +1,1 @@
-"""Ewald sums: k-space sums, smooth particle mesh Ewald (PME), corrections, estimated errors."""
+"""Ewald sums: reciprocal sums, smooth particle mesh Ewald (PME), corrections, estimated errors."""

@@ -1,4 +1,4 @@
-"""The corrections of an Ewald sum, beside the sums over pairs and over k; `ewald` has the whole formula."""
+"""Correction terms of an Ewald sum; `direct_sum` has the whole formula."""
 
 from math import pi, sqrt
 from typing import NamedTuple
@@ -42,13 +42,10 @@ class SurfaceDipole(NamedTuple):
     sites: BodySites | CentralSites
 
     def workspace(self, setup: Setup) -> "SurfaceWorkspace":
-        """Room for positions and forces."""
         return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))
 
 
 class SurfaceWorkspace(NamedTuple):
-    """Workspace of a `SurfaceDipole`."""
-
     strength: float
     charge: np.ndarray
     sites: BodySites | CentralSites
@@ -87,10 +84,8 @@ def _add_surface_dipole(term, state, load, tally):
 
 
 def self_energy(charge: np.ndarray, alpha: float) -> float:
-    """Energy that removes the interaction of each charge with its own screening charge.
-
-    charge (s,) in units where q²/r is an energy in u Å²/ps²
-    """
+    """Energy that removes the interaction of each charge with its own screening charge. charge (s,) in units where q²/r
+    is an energy in u Å²/ps²"""
     return -alpha / sqrt(pi) * float(charge @ charge)
 
 

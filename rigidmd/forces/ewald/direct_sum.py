@@ -1,7 +1,7 @@
-"""Ewald sums: charges in a periodic box with all their images, and the sum over wave vectors one by one.
+"""Ewald sums: charges in a periodic box with all their images, and the direct sum over k-vectors.
 
-    E = sum over pairs inside the cut-off q_i q_j erfc(alpha r)/r     screened.ScreenedCoulomb
-      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²           EwaldSum, or mesh.Pme
+    E = sum over pairs inside the cutoff q_i q_j erfc(alpha r)/r      screened_coulomb.ScreenedCoulomb
+      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²           EwaldSum, or pme.Pme
       - alpha/sqrt(pi) sum q_i²                                       corrections.self_energy
       - sum over pairs inside molecules q_i q_j erf(alpha r)/r        corrections.intramolecular_energy
       - pi/(2 V alpha²) (sum q_i)²                                    corrections.Background
@@ -43,15 +43,15 @@ WIDTH = lane_count(np.float64)
 class KSpaceSums(NamedTuple):
     """Arrays of an Ewald sum. The sites are padded to whole vectors with charges of 0."""
 
-    cell: np.ndarray  # (3, 3) the cell of the present strengths
+    cell: np.ndarray  # (3, 3) the cell for which `strength` was computed
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
     force: np.ndarray  # (s, 3)
     charge: np.ndarray  # (slots,)
     cosine: np.ndarray  # (3, largest n + 1, slots) of 2 pi n times the fractional coordinate
     sine: np.ndarray
-    strength: np.ndarray  # (waves,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
-    real: np.ndarray  # (waves,) real part of S(k), then of 2 strength S(k)
+    strength: np.ndarray  # (k-vectors,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
+    real: np.ndarray  # (k-vectors,) real part of S(k), then of 2 strength S(k)
     imaginary: np.ndarray
     force_by_component: np.ndarray  # (3, slots) forces on the sites, by component
     tallies: np.ndarray  # (blocks, 10)
@@ -59,7 +59,7 @@ class KSpaceSums(NamedTuple):
 
 
 class EwaldSum(NamedTuple):
-    """The sum over wave vectors one by one."""
+    """The direct sum over k-vectors."""
 
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
@@ -67,31 +67,20 @@ class EwaldSum(NamedTuple):
     k_vectors: KVectors
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
-        """Room for the sums, which are always in double precision."""
         s, k_vectors = len(self.charge), self.k_vectors
         slots = -(-s // WIDTH) * WIDTH
         angles = (3, int(k_vectors.most.max()) + 1, slots)
         sums = KSpaceSums(
-            cell=np.zeros((3, 3)),
-            reciprocal=np.zeros((3, 3)),
-            position=np.zeros((s, 3)),
-            force=np.zeros((s, 3)),
-            charge=np.concatenate([self.charge, np.zeros(slots - s)]),
-            cosine=np.zeros(angles),
-            sine=np.zeros(angles),
-            strength=np.zeros(k_vectors.total // 2),
-            real=np.zeros(k_vectors.total // 2),
-            imaginary=np.zeros(k_vectors.total // 2),
-            force_by_component=np.zeros((3, slots)),
-            tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)),
-            virial=virial_buffer(),
-        )
+            cell=np.zeros((3, 3)), reciprocal=np.zeros((3, 3)), position=np.zeros((s, 3)), force=np.zeros((s, 3)),
+            charge=np.concatenate([self.charge, np.zeros(slots - s)]), cosine=np.zeros(angles), sine=np.zeros(angles),
+            strength=np.zeros(k_vectors.total // 2), real=np.zeros(k_vectors.total // 2),
+            imaginary=np.zeros(k_vectors.total // 2), force_by_component=np.zeros((3, slots)),
+            tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)), virial=virial_buffer(),
+        )  # fmt: skip
         return EwaldWorkspace(self.alpha, self.sites, k_vectors, sums)
 
 
 class EwaldWorkspace(NamedTuple):
-    """Workspace of an `EwaldSum`."""
-
     alpha: float
     sites: BodySites | CentralSites
     k_vectors: KVectors
@@ -104,17 +93,10 @@ class EwaldWorkspace(NamedTuple):
         return self.sums.force
 
     def with_code(self) -> "EwaldWorkspace":
-        """With its machine code."""
         content = (self.alpha, self.k_vectors, self.sums)
         moved = site_tasks(self.sites, self.sums.position, self.sums.force, self.sums.virial)
-        return self._replace(
-            code=Code(
-                phases=(_compute_phases, content),
-                sum=(_sum_structure_factors, content),
-                forces=(_compute_forces, content),
-                **moved,
-            )
-        )
+        tasks = {"phases": _compute_phases, "sum": _sum_structure_factors, "forces": _compute_forces}
+        return self._replace(code=Code(**{name: (one, content) for name, one in tasks.items()}, **moved))
 
 
 @kernel
@@ -133,7 +115,7 @@ def invert_cell(cell, reciprocal):
     return volume
 
 
-@implements(terms.add_forces, EwaldWorkspace, counted=False)
+@implements(terms.add_forces, EwaldWorkspace, count_references=False)
 def _add_ewald_sum(term, state, load, tally):
     sums = term.sums
     placed, molecules = pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position))
@@ -171,9 +153,9 @@ def _set_strengths(k_vectors, sums, alpha, volume):
             sums.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
 
 
-@task(counted=False)
+@task(count_references=False)
 def _compute_phases(arguments, block):
-    """Cosines and sines for a share of the sites, by recurrence: one complex product for each multiple of the angle."""
+    """exp(2 pi i n x) of the sites of a block, by recurrence: one complex product for each multiple of the angle."""
     _alpha, k_vectors, sums = load_arguments(arguments)
     blocks, s = len(sums.tallies), len(sums.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
@@ -191,7 +173,7 @@ def _compute_phases(arguments, block):
                 sums.sine[d, n, i] = b * cosine + a * sine
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _phase(sums, d, n, at):
     """exp(2 pi i n x_d) of a vector of sites, as (cosine, sine)."""
     cosine = load(sums.cosine[d, abs(n)], at)
@@ -204,9 +186,9 @@ def _times(a, b):
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
-@task(counted=False)
+@task(count_references=False)
 def _sum_structure_factors(arguments, block):
-    """S(k) of the columns of a block, with energy and virial; S(k) is then multiplied for the forces."""
+    """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength for the forces."""
     alpha, k_vectors, sums = load_arguments(arguments)
     width = lanes_of(sums.charge)
     sums.tallies[block] = 0.0
@@ -215,7 +197,7 @@ def _sum_structure_factors(arguments, block):
         for n in range(count):
             sums.real[first + n] = 0.0
             sums.imaginary[first + n] = 0.0
-        # sites are taken in batches that stay in the L1 cache for a whole column
+        # batches of sites stay in the L1 cache for a whole column
         for batch in range(0, len(sums.charge), 32 * width):
             end = min(batch + 32 * width, len(sums.charge))
             for n in range(count):
@@ -232,18 +214,11 @@ def _sum_structure_factors(arguments, block):
                 sums.real[first + n] += sum_lanes(real)
                 sums.imaginary[first + n] += sum_lanes(imaginary)
         for n in range(count):
-            _add_k_vector(
-                sums,
-                alpha,
-                k_vectors.column[c, 0],
-                k_vectors.column[c, 1],
-                k_vectors.column[c, 2] + n,
-                first + n,
-                block,
-            )
+            nz, index = k_vectors.column[c, 2] + n, first + n
+            _add_k_vector(sums, alpha, k_vectors.column[c, 0], k_vectors.column[c, 1], nz, index, block)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _add_k_vector(sums, alpha, nx, ny, nz, index, block):
     tally = sums.tallies[block]
     real, imaginary, strength = sums.real[index], sums.imaginary[index], sums.strength[index]
@@ -262,19 +237,17 @@ def _add_k_vector(sums, alpha, nx, ny, nz, index, block):
 
 @kernel(inline=True)
 def add_k_vector_virial(tally, energy, k, slope):
-    """Add the virial energy (1 - slope k k) of a wave with an energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
-
-    slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)
-    """
+    """Add the virial energy (1 - slope k k) of a k-vector, its energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
+    slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)"""
     for row in range(3):
         for column in range(3):
             unit = 1.0 if row == column else 0.0
             tally[1 + 3 * row + column] += energy * (unit - slope * k[row] * k[column])
 
 
-@task(counted=False)
+@task(count_references=False)
 def _compute_forces(arguments, block):
-    """Forces on a share of the sites."""
+    """Forces on the sites of a block."""
     _alpha, k_vectors, sums = load_arguments(arguments)
     width = lanes_of(sums.charge)
     blocks, vectors = len(sums.tallies), len(sums.charge) // width
@@ -306,7 +279,7 @@ def _compute_forces(arguments, block):
 def ewald_sum_in_numpy(
     charge: np.ndarray, position: np.ndarray, cell: np.ndarray, alpha: float, k_vectors: KVectors
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy: for single uses."""
+    """Energy, forces (s, 3) and site virial (3, 3) of charges (s,) at positions (s, 3), in NumPy."""
     reciprocal = 2 * pi * np.linalg.inv(cell).T
     turns = position @ reciprocal.T
     energy, force, virial = 0.0, np.zeros_like(position), np.zeros((3, 3))

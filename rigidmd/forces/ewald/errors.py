@@ -1,8 +1,8 @@
-"""Errors of Ewald sums, estimated before a run, and the settings that keep them within a given accuracy.
+"""Estimated errors of Ewald sums, and the settings that keep them within a given accuracy.
 
 An error is the root mean square over sites of the error vector of the force on a site, for molecules with random
-positions and orientations. Its unit is COULOMB, the force between two charges e at a distance of 1 Å, like that of the
-accuracy of LAMMPS' kspace_style.
+positions and orientations. Its unit is COULOMB, the force between two charges e at a distance of 1 Å, as for the
+accuracy of kspace_style in LAMMPS.
 """
 
 from math import exp, pi, sqrt
@@ -13,22 +13,17 @@ from scipy.optimize import brentq
 
 from rigidmd.forces.ewald.splines import aliases
 
-MAX_ALPHA_CUTOFF = 8.0  # alpha times a cut-off: erfc is 1e-29 there
-MAX_PROXY_POINTS = (
-    32  # most points along an edge in estimates: errors depend on the spacing, not on the number of points
-)
+MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
+MAX_PROXY_POINTS = 32  # along an edge in estimates: errors depend on the spacing, not on the number of points
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
-#: Along an edge: an edge of 0.1 mm has not more.
-MAX_GRID_POINTS = 2**16
-
-
-#: Distances inside molecules that agree to so many digits (Å) count as the same; with many charges all in a bin do.
+MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
+#: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those in bins of COARSE Å.
 FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
 
 
 class Charges(NamedTuple):
-    """What the errors depend on: the charges, and their arrangement in rigid molecules."""
+    """The charges and their arrangement in rigid molecules, on which the errors depend."""
 
     count: int  # charged sites
     square: float  # sum of q², e²
@@ -59,7 +54,7 @@ def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
 
 
 def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Sums of products (p,) over pairs of one distance, and these distances (d, 2), in the order in which they come."""
+    """Sums of products (p,) over pairs of one distance, with these distances, (d, 2), in order of appearance."""
     _, first, which = np.unique(distances, return_index=True, return_inverse=True)
     sums = np.zeros(len(first))
     np.add.at(sums, which, products)
@@ -69,23 +64,20 @@ def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
-    """Error from the pairs beyond the cut-off (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+    """Error from the pairs beyond the cutoff (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
     return 2 * charges.square / sqrt(charges.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
 
 
 def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
-    """alpha (1/Å) at which the pairs beyond the cut-off make this error."""
+    """The alpha (1/Å) at which the pairs beyond the cutoff cause this error."""
     most = real_error(charges, 0.0, cutoff, volume)
     # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
 
 
 def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
-    """Error from the waves beyond k = radius (1/Å): an integral over all of them.
-
-    Like eq. 32 of Kolafa & Perram, but the charges inside a molecule are correlated, and the integral is not expanded
-    for large radius/alpha.
-    """
+    """Error from the k-vectors beyond k = radius (1/Å), as an integral over them. Like eq. 32 of Kolafa & Perram, but
+    the charges inside a molecule are correlated, and the integral is not expanded for large radius/alpha."""
     k = np.linspace(radius, radius + 12 * alpha, 600)
     # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
     density = 8 * np.exp(-(k**2) / (2 * alpha**2)) * charges.form(k)
@@ -93,7 +85,7 @@ def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) 
 
 
 def k_cutoff_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
-    """The radius of k (1/Å) at which the waves beyond it make this error."""
+    """The cutoff radius in k (1/Å) at which the k-vectors beyond it cause this error."""
     volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
     least = np.linalg.norm(reciprocal, axis=1).min()
     longest = 12 * alpha + least
@@ -106,16 +98,17 @@ def k_cutoff_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: 
 
 
 def k_cutoff_of_count(count: int, volume: float) -> float:
-    """Radius (1/Å) of a sphere in k that holds `count` waves."""
+    """Radius (1/Å) of a sphere in k that contains `count` k-vectors."""
     return (6 * pi**2 * count / volume) ** (1 / 3)
 
 
 def pme_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
-    """Error of smooth PME with the influence function G of `mesh`, on a grid in a cell (3, 3), rows the edges.
+    """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows the edges.
 
-    A wave k of charge gives waves k' of potential, k and its aliases, with factors G U(k) U(k'). The error is the
-    difference of G U² from g for k' = k, and the whole wave for all other k'. They add up in the mean square, with k'²
-    each for the force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106).
+    A Fourier component k of the charge causes components k' of the potential, at k and its aliases, with factors
+    G U(k) U(k'). The error is the difference of G U² from g for k' = k, and the whole component for other k'. Errors
+    add up in the mean square, times k'² for the force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem.
+    Phys. 128, 214106).
     """
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
@@ -136,7 +129,7 @@ def pme_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int,
         weakened = weakened + metric[d, d] * second[d] * every[o] * every[e]
         weakened = weakened + 2 * metric[d, o] * first[d] * first[o] * every[e]
     square = square * np.ones_like(weakened)
-    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # the wave 0 is excluded
+    square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # k = 0 is excluded
     kept, whole = unaliased[0] * unaliased[1] * unaliased[2], every[0] * every[1] * every[2]
     g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
     influence = square * g * kept / (whole * weakened)
@@ -167,17 +160,10 @@ def fft_size(least: float) -> int:
 
 
 def pme_grid_for(
-    charges: Charges,
-    alpha: float,
-    cell: np.ndarray,
-    error: float,
-    order: int | None = None,
-    grid: tuple[int, int, int] | None = None,
-) -> tuple[tuple[int, int, int], int] | None:
-    """The grid and order of splines with the least work for at most this error; None if there are none.
-
-    order, grid : fixed, if given
-    """
+    charges: Charges, alpha: float, cell: np.ndarray, error: float,
+    order: int | None = None, grid: tuple[int, int, int] | None = None,
+) -> tuple[tuple[int, int, int], int] | None:  # fmt: skip
+    """The fastest grid and spline order with at most this error; None if none has. order, grid : fixed, if given"""
     edges = np.linalg.norm(cell, axis=1)
     sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
     grids = [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]

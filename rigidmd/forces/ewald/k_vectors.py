@@ -1,4 +1,4 @@
-"""The wave vectors of an Ewald sum: integer vectors n, in columns along n_z, with k = 2 pi n times reciprocal edges."""
+"""The k-vectors of an Ewald sum: integer vectors n, in columns along n_z, with k = 2 pi n times reciprocal edges."""
 
 from math import pi
 from typing import NamedTuple
@@ -7,12 +7,11 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS
 
-#: The basis of a cell that was not changed from its description.
-SAME_BASIS = np.eye(3, dtype=int)
+SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its description
 
 
 class KVectors(NamedTuple):
-    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are their negatives."""
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are minus these."""
 
     column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
     count: np.ndarray  # (columns,) number of n_z
@@ -61,7 +60,7 @@ def k_vectors_within(
 
 
 def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """The n (..., 3) of the same wave vectors in the other cell, see `k_vectors_up_to`."""
+    """The n (..., 3) of the same k-vectors in the other cell, see `k_vectors_up_to`."""
     return n @ np.rint(np.linalg.inv(basis)).astype(int).T
 
 

@@ -3,17 +3,16 @@
     charges -> grid -> Fourier transform, times the influence function -> potential on the grid -> forces
 
 Charges are spread over order³ grid points by B-splines, and forces are the exact gradient of the energy on the grid
-(Essmann et al. 1995, J. Chem. Phys. 103, 8577), so a run conserves that energy. The influence function is not that of
-Essmann et al. but the one with the smallest error of the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda &
-Holm 2012, J. Chem. Theory Comput. 8, 936, for forces by differentiation): the same work with smaller errors.
+(Essmann et al. 1995, J. Chem. Phys. 103, 8577), so a run conserves that energy. The influence function has the smallest
+error of the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda & Holm 2012, J. Chem. Theory Comput. 8, 936, for
+forces by differentiation): smaller errors than with the function of Essmann et al., in the same time.
 
 The forces from the grid do not sum to zero, and pairs inside a rigid molecule exert a force on it. Both are part of the
-error that `errors.pme_error` estimates. Subtracting them would leave forces that are not a gradient.
+error that `errors.pme_error` estimates. Without them the forces would not be a gradient.
 
-The work is divided into blocks of planes, of rows of spectrum_shape, and of sites. Sites are sorted by plane, and each plane is
-written by one block. The number of blocks does not depend on that of threads, so the bits of the result do not either.
-
-This file needs rocket-fft; only scenes with PME import it.
+The work is divided into blocks of planes, of rows of Fourier components, and of sites. Sites are sorted by plane, and
+each plane is written by one block. The number of blocks does not depend on the number of threads, so the result is the
+same bit for bit. This module needs rocket-fft; only scenes with PME import it.
 """
 
 from math import pi
@@ -51,8 +50,8 @@ from rigidmd.forces.neighbors.sites import (
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
 
-PLANES = 16  # of a block, where there are more blocks than the fewest
-SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, and no thread is started
+PLANES = 16  # of a block, if there are more blocks than the minimum
+SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on the main thread
 
 
 class LowOrderSpline(NamedTuple):
@@ -72,10 +71,10 @@ class HighOrderSpline(NamedTuple):
 
 
 class PmeMesh(NamedTuple):
-    """The grid and its arrays. Rows of points are longer than the grid, so that splines need not wrap around."""
+    """The grid and its arrays. Rows are longer than the grid, so that splines do not wrap around."""
 
     points: np.ndarray  # (3,) number along a, b, c
-    bounds: np.ndarray  # (3, blocks + 1) of planes, rows of waves and sites
+    bounds: np.ndarray  # (3, blocks + 1) of planes, rows of Fourier components and sites
     cell: np.ndarray  # (3, 3)
     reciprocal: np.ndarray  # (3, 3) rows 2 pi times the reciprocal edges, 1/Å
     position: np.ndarray  # (s, 3)
@@ -86,9 +85,9 @@ class PmeMesh(NamedTuple):
     first: np.ndarray  # (n_a + 1,) plane p has sites order[first[p]] ... order[first[p + 1] - 1]
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
     spectrum: np.ndarray  # (n_a, n_b, n_c//2 + 1)
-    influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) factor from waves of charge to waves of potential
+    influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) potential over charge, by Fourier component
     alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
-    axes: np.ndarray  # (3, 1) numbers of the axes, for the transforms
+    axes: np.ndarray  # (3, 1) indices of the axes, for the transforms
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
     not_finite: np.ndarray  # (blocks,) whether a position is not finite
@@ -105,7 +104,6 @@ class Pme(NamedTuple):
     order: int  # of the splines
 
     def workspace(self, setup: Setup) -> "PmeWorkspace":
-        """Room for the grid, in the precision of the setup."""
         grid, order = self.grid, self.order
         kind = np.dtype(setup.dtype)
         pair = np.complex64 if kind == np.float32 else np.complex128
@@ -124,31 +122,19 @@ class Pme(NamedTuple):
         spectrum_shape = (grid[0], grid[1], grid[2] // 2 + 1)
         mesh = PmeMesh(
             points=np.array(grid, np.int64),
-            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(),
-            cell=np.zeros((3, 3)),
-            reciprocal=np.zeros((3, 3)),
-            position=np.zeros((s, 3)),
-            force=np.zeros((s, 3)),
-            corner=np.zeros((s, 3), np.int32),
-            offset=np.zeros((s, 4), kind),
-            order=np.zeros(s, np.int32),
+            bounds=np.linspace(0, [grid[0], grid[1], s], blocks + 1).astype(np.int64).T.copy(), cell=np.zeros((3, 3)),
+            reciprocal=np.zeros((3, 3)), position=np.zeros((s, 3)), force=np.zeros((s, 3)),
+            corner=np.zeros((s, 3), np.int32), offset=np.zeros((s, 4), kind), order=np.zeros(s, np.int32),
             first=np.zeros(grid[0] + 1, np.int64),
             grid=np.zeros((grid[0], grid[1] + order - 1, grid[2] + width), kind),
-            spectrum=np.zeros(spectrum_shape, pair),
-            influence=np.zeros(spectrum_shape, kind),
-            alias=table,
-            axes=np.arange(3)[:, None],
-            tallies=np.zeros((blocks, TALLY_SIZE)),
-            virial=virial_buffer(),
-            not_finite=np.zeros(blocks, np.bool_),
-            weight=np.zeros((blocks, 64), kind),
-        )
+            spectrum=np.zeros(spectrum_shape, pair), influence=np.zeros(spectrum_shape, kind), alias=table,
+            axes=np.arange(3)[:, None], tallies=np.zeros((blocks, TALLY_SIZE)), virial=virial_buffer(),
+            not_finite=np.zeros(blocks, np.bool_), weight=np.zeros((blocks, 64), kind),
+        )  # fmt: skip
         return PmeWorkspace(self.alpha, self.charge, self.sites, spline, mesh)
 
 
 class PmeWorkspace(NamedTuple):
-    """Workspace of a `Pme`."""
-
     alpha: float
     charge: np.ndarray
     sites: BodySites | CentralSites
@@ -162,7 +148,6 @@ class PmeWorkspace(NamedTuple):
         return self.mesh.force
 
     def with_code(self) -> "PmeWorkspace":
-        """With its machine code."""
         content = (self.alpha, self.charge, self.spline, self.mesh)
         tasks = (
             _set_influence,
@@ -180,7 +165,7 @@ class PmeWorkspace(NamedTuple):
         return self._replace(code=Code(**found, **moved))
 
 
-@implements(terms.add_forces, PmeWorkspace, counted=False)
+@implements(terms.add_forces, PmeWorkspace, count_references=False)
 def _add_pme(term, state, load, tally):
     code, mesh = term.code, term.mesh
     blocks = len(mesh.tallies)
@@ -211,20 +196,16 @@ def _add_pme(term, state, load, tally):
     return OK
 
 
-@task(counted=False)
+@task(count_references=False)
 def _set_influence(arguments, block):
-    """Influence function for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
+    """The influence function for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
     alpha, _charge, _spline, mesh = load_arguments(arguments)
     b, of = mesh.reciprocal, mesh.alias
-    volume = (
-        8
-        * pi**3
-        / abs(
-            b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
-            - b[0, 1] * (b[1, 0] * b[2, 2] - b[1, 2] * b[2, 0])
-            + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
-        )
-    )
+    volume = 8 * pi**3 / abs(
+        b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
+        - b[0, 1] * (b[1, 0] * b[2, 2] - b[1, 2] * b[2, 0])
+        + b[0, 2] * (b[1, 0] * b[2, 1] - b[1, 1] * b[2, 0])
+    )  # fmt: skip
     for x in range(mesh.spectrum.shape[0]):
         for y in range(mesh.bounds[1, block], mesh.bounds[1, block + 1]):
             for z in range(mesh.spectrum.shape[2]):
@@ -249,9 +230,9 @@ def _set_influence(arguments, block):
                     mesh.influence[x, y, z] = g * unaliased / (whole * weakened)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _scale_positions(arguments, block):
-    """Positions of a share of the sites in grid cells."""
+    """Positions of the sites of a block in grid cells."""
     _alpha, charge, _spline, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
@@ -271,7 +252,7 @@ def _scale_positions(arguments, block):
         mesh.offset[i, 3] = charge[i]
 
 
-@task(counted=False)
+@task(count_references=False)
 def _sort_sites(arguments, block):
     """Sort sites by the plane of their corner; the sort is stable."""
     _alpha, _charge, _spline, mesh = load_arguments(arguments)
@@ -291,35 +272,33 @@ def _sort_sites(arguments, block):
 
 
 def load_vector(spline, array, index):
-    """Numbers of an array from an index on, as a vector of four or eight, like the spline's weights."""
+    """Numbers of an array from an index on, as a vector of four or eight, as the weights of the spline."""
     raise TypeError("compiled code only")
 
 
-@implements(load_vector, inline=True, counted=False)
+@implements(load_vector, inline=True, count_references=False)
 def _load_vector(spline, array, index):
     if is_a(spline, LowOrderSpline):
         return lambda spline, array, index: load_four(array, index)
     return lambda spline, array, index: load_eight(array, index)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def weights_at(spline, offset):
     """Weights of the grid points from the corner on, as a vector."""
     return _polynomials(spline, spline.value, spline.nodes, offset)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def slopes_at(spline, offset):
     """Derivatives of these weights, per grid cell."""
     return _polynomials(spline, spline.slope, spline.nodes[1:], offset)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _polynomials(spline, coefficients, powers, offset):
-    """Polynomials in `offset`, one in each lane, from coefficients (powers width,).
-
-    powers : a tuple, whose length is a constant at compile time, so that the loop is unrolled
-    """
+    """Polynomials in `offset`, one in each lane, from coefficients (powers width,). powers : a tuple, whose length is a
+    constant at compile time, so that the loop is unrolled"""
     terms = len(powers)
     width = len(coefficients) // terms
     found = load_vector(spline, coefficients, width * (terms - 1))
@@ -328,9 +307,9 @@ def _polynomials(spline, coefficients, powers, offset):
     return found
 
 
-@task(counted=False)
+@task(count_references=False)
 def _spread_charges(arguments, block):
-    """Spread charges over the planes of a block, and transform them within the planes."""
+    """Spread charges over the planes of a block, and Fourier transform the planes."""
     _alpha, _charge, spline, mesh = load_arguments(arguments)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
@@ -364,21 +343,21 @@ def _spread_charges(arguments, block):
     c2c(mesh.spectrum[low:high], mesh.spectrum[low:high], mesh.axes[1], True, 1.0, 1)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _convolve(arguments, block):
     alpha, _charge, _spline, mesh = load_arguments(arguments)
     convolve_block(alpha, mesh, None, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _convolve_with_virial(arguments, block):
     alpha, _charge, _spline, mesh = load_arguments(arguments)
     convolve_block(alpha, mesh, mesh.tallies, block)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def convolve_block(alpha, mesh, tallies, block):
-    """From waves of charge to waves of potential for a block of rows; energy and virial into `tallies` unless None."""
+    """Multiply a block of rows by the influence function; energy and virial into `tallies` unless None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     spectrum, of, b = mesh.spectrum, mesh.alias, mesh.reciprocal
     if tallies is not None:
@@ -397,7 +376,7 @@ def convolve_block(alpha, mesh, tallies, block):
                         n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
                     )
                     k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
-                    # waves with n_c and -n_c are stored once, unless they are the same
+                    # components n_c and -n_c are stored once, unless they are the same
                     multiplicity = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = multiplicity * strength * (real * real + imaginary * imaginary)
@@ -406,7 +385,7 @@ def convolve_block(alpha, mesh, tallies, block):
     c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _transform_back(arguments, block):
     """Transform the planes of a block back to the potential."""
     _alpha, _charge, spline, mesh = load_arguments(arguments)
@@ -425,9 +404,9 @@ def _transform_back(arguments, block):
                 grid[plane, nb + k, c] = grid[plane, k, c]
 
 
-@task(counted=False)
+@task(count_references=False)
 def _interpolate_forces(arguments, block):
-    """Forces on a share of the sites: minus the gradient of the potential at each site, times its charge."""
+    """Forces on the sites of a block: minus the gradient of the potential at each site, times its charge."""
     _alpha, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)

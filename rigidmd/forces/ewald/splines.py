@@ -1,8 +1,8 @@
-"""Cardinal B-splines: the spreading of charges over the points of a grid, and its effect on waves.
+"""Cardinal B-splines, which spread charges over the points of a grid, and their effect on Fourier components.
 
 M_p is a polynomial of degree p - 1 between neighbouring points, p points wide and p - 2 times differentiable (Essmann
-et al. 1995, J. Chem. Phys. 103, 8577, eq. 4.1). On a grid of K points a wave n cannot be told from its aliases n + m K,
-which spreading multiplies by U(n + m K) = sinc((n + m K)/K)^p.
+et al. 1995, J. Chem. Phys. 103, 8577, eq. 4.1). A grid of K points cannot distinguish a Fourier component n from its
+aliases n + m K. Spreading multiplies these by U(n + m K) = sinc((n + m K)/K)^p.
 """
 
 from math import factorial
@@ -22,10 +22,10 @@ def weights(order: int) -> np.ndarray:
 
 
 class Aliases(NamedTuple):
-    """Sums over the aliases of each wave of one axis (points,), in the order of an FFT."""
+    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an FFT."""
 
     n: np.ndarray  # -K/2 < n <= K/2
-    odd: np.ndarray  # n, but 0 where n and -n are the same wave
+    odd: np.ndarray  # n, but 0 where n and -n are the same component
     unaliased: np.ndarray  # U(n)²
     all: np.ndarray  # sum over m of U(n + m K)²
     first: np.ndarray  # sum of (n + m K) U²
@@ -41,10 +41,6 @@ def aliases(points: int, order: int) -> Aliases:
     nyquist = 2 * n == points
     first = np.where(nyquist, 0.0, (every * squared).sum(axis=1))
     return Aliases(
-        n,
-        np.where(nyquist, 0, n),
-        np.sinc(n / points) ** (2 * order),
-        squared.sum(axis=1),
-        first,
+        n, np.where(nyquist, 0, n), np.sinc(n / points) ** (2 * order), squared.sum(axis=1), first,
         (every**2 * squared).sum(axis=1),
-    )
+    )  # fmt: skip

@@ -1,6 +1,6 @@
-"""What acts on molecules from outside: electric fields, gravity, walls, restraints.
+"""External forces on molecules: electric fields, gravity, walls, restraints.
 
-These forces are tied to the lab, not to other molecules. The pressure of a box is that of the molecules on one another:
-none of these terms adds to the molecular virial. Of each term, `changes_momentum` says which components of the total
-momentum it changes, and `tied_to_places` whether its energy depends on where in the lab molecules are.
+They do not act between molecules, so none of them adds to the molecular virial, from which the pressure of a box is
+computed. The attribute `changes_momentum` of a term lists the components of the total momentum that it changes;
+`tied_to_places` is whether its energy depends on the positions of molecules in the lab.
 """

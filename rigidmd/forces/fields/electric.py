@@ -5,13 +5,13 @@
 with the net charge q of a molecule, its centre of mass R and its dipole mu about that. The force on it is q E, the
 torque mu x E.
 
-R is never wrapped, so a charge that travels through the images of a periodic box keeps gaining the work of the field:
-with a net charge U has no lower bound, but kinetic and potential energy together are conserved. The energy of molecules
-without a net charge does not depend on R.
+R is never wrapped, so a charge that moves through the images of a periodic box keeps gaining energy from the field.
+With a net charge U has no lower bound, but kinetic plus potential energy is conserved. The energy of molecules without
+a net charge does not depend on R.
 
-With an oscillating field they are conserved only together with what the field puts in, dH/dt = dU/dt at rest =
--(dE/dt) . M. The books take that up at every kick with the kick's share of the step. This is the flow of the momentum
-that belongs to time as a coordinate, so energy less books is conserved as well as any Hamiltonian is by the scheme.
+With an oscillating field, energy is conserved only together with the work of the field, dH/dt = dU/dt at fixed
+positions = -(dE/dt) . M. Every kick adds this work over its part of the step to the energy ledger. This is the flow of
+the momentum that is conjugate to time as a coordinate, so energy less work is conserved as well as any Hamiltonian.
 """
 
 from math import cos, sin
@@ -29,20 +29,20 @@ class ElectricField(NamedTuple):
     """A steady uniform field."""
 
     species: np.ndarray  # (n,) int32
-    charge: np.ndarray  # (species,) net charge, e; 0 of what is frozen
-    dipole_body: np.ndarray  # (species, 3) about the centre of mass, e Å; 0 of what is frozen
+    charge: np.ndarray  # (species,) net charge, e; 0 for a frozen species
+    dipole_body: np.ndarray  # (species, 3) about the centre of mass, e Å; 0 for a frozen species
     field: np.ndarray  # (3,) lab frame, force on a charge e, u Å/ps²
 
     @property
     def changes_momentum(self) -> np.ndarray:
-        """Components (3,) of the total momentum that it changes: along it, where the charges do not cancel."""
+        """Components (3,) of the total momentum that it changes: those along the field, unless the charges cancel."""
         charge = self.charge[self.species]
         cancels = abs(charge.sum()) <= 1e-10 * np.abs(charge).sum()
         return np.zeros(3, bool) if cancels else self.field != 0
 
     @property
     def tied_to_places(self) -> bool:
-        """Whether its energy depends on where in the lab molecules are: if any has a net charge."""
+        """Whether its energy depends on positions in the lab: if any molecule has a net charge."""
         return bool(self.charge[self.species].any())
 
 

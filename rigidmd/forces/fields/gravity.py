@@ -13,7 +13,7 @@ class Gravity(NamedTuple):
     """U = -sum m g . R: the force m g at each centre of mass R, which is never wrapped."""
 
     species: np.ndarray  # (n,) int32
-    mass: np.ndarray  # (species,) u; 0 of what is frozen
+    mass: np.ndarray  # (species,) u; 0 for a frozen species
     acceleration: np.ndarray  # (3,) lab frame, Å/ps²
 
     tied_to_places = True

@@ -1,4 +1,4 @@
-"""Forces on molecules that Python computes, and the compiled loop asks for."""
+"""Forces on molecules that a Python function computes when the compiled step loop requests them."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,15 +11,14 @@ from rigidmd.forces.terms import Setup, add_forces
 
 
 class PythonForces(NamedTuple):
-    """Forces from a Python function, which the engine holds."""
+    """Forces from a Python function, which the engine calls."""
 
     molecules: int
-    turns: bool  # whether molecules turn
+    turns: bool  # whether molecules rotate
     changes_momentum: np.ndarray  # (3,) components of the total momentum that they may change
-    tied_to_places: bool  # the energy depends on places in the lab
+    tied_to_places: bool  # whether the energy depends on positions in the lab
 
     def workspace(self, setup: Setup) -> "PythonForcesWorkspace":
-        """Room for the values."""
         n = self.molecules
         return PythonForcesWorkspace(
             np.zeros(1, np.int64), np.zeros((n, 3)), np.zeros((n if self.turns else 0, 3)), np.zeros(TALLY_SIZE)
@@ -27,15 +26,15 @@ class PythonForces(NamedTuple):
 
 
 class PythonForcesWorkspace(NamedTuple):
-    """Workspace of a `PythonForces`; it asks for new values whenever positions have changed."""
+    """Workspace of a `PythonForces`; it requests new values (NEEDS_PYTHON_FORCES) whenever positions have changed."""
 
-    fresh: np.ndarray  # (1,) 1 if the values are those of the present moment
+    fresh: np.ndarray  # (1,) 1 if the values are those at the present positions
     force: np.ndarray  # (n, 3) lab, u Å/ps²
     torque_body: np.ndarray  # (n, 3), u Å²/ps²
     tally: np.ndarray  # (10,) energy and molecular virial
 
     def update(self, function: Callable[["PythonForcesWorkspace", State], None], state: State) -> None:
-        """Let a function fill in the forces at a state."""
+        """Let a function write the forces at a state into this workspace."""
         function(self, state)
 
 

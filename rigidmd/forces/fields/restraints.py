@@ -1,4 +1,4 @@
-"""Springs that hold the centres of mass of some molecules at places in the lab."""
+"""Harmonic restraints of the centres of mass of some molecules to reference positions in the lab."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,7 @@ from rigidmd.forces.terms import add_forces
 
 
 class Restraints(NamedTuple):
-    """U = sum over some molecules and over axes of stiffness/2 (R - place)².
-
-    R is never wrapped: a molecule is held at its place, not at images of it.
-    """
+    """U = sum over restrained molecules and axes of stiffness/2 (R - reference)². R is never wrapped."""
 
     molecule: np.ndarray  # (r,) int64, each once
     reference: np.ndarray  # (r, 3) lab frame, Å

@@ -1,12 +1,12 @@
-"""Two flat walls perpendicular to an axis of the lab, or one of them. They act on sites, at unwrapped positions.
+"""One or two flat walls perpendicular to an axis of the lab, which act on sites at unwrapped positions.
 
-    Lennard-Jones 9-3 : U = epsilon [(2/15) (sigma/d)^9 - (sigma/d)^3], less its value at the cut-off, and 0 beyond it
-    harmonic          : U = stiffness/2 d² behind the wall, 0 before it
+    Lennard-Jones 9-3 : U = epsilon [(2/15) (sigma/d)^9 - (sigma/d)^3], less its value at the cutoff, and 0 beyond it
+    harmonic          : U = stiffness/2 d² behind the wall, 0 in front of it
 
 with the distance d of a site from the wall. The first is half a space of Lennard-Jones sites, integrated (Steele 1973,
-Surf. Sci. 36, 317; `fix wall/lj93` of LAMMPS has the same form and end), with a well of depth (sqrt(10)/3) epsilon at
-(2/5)^(1/6) sigma. It means nothing on the wall and behind it, and a site there ends the evaluation with BEHIND_WALL.
-The harmonic one is soft; `fix wall/harmonic` of LAMMPS has no factor 1/2.
+Surf. Sci. 36, 317; `fix wall/lj93` of LAMMPS has the same form and truncation), with a well of depth (sqrt(10)/3)
+epsilon at (2/5)^(1/6) sigma. It is not defined on and behind the wall: a site there ends the evaluation with
+BEHIND_WALL. The harmonic wall is soft; `fix wall/harmonic` of LAMMPS has no factor 1/2.
 """
 
 from math import isnan
@@ -35,11 +35,11 @@ class LennardJonesWalls(NamedTuple):
 
     @property
     def changes_momentum(self) -> np.ndarray:
-        """Components (3,) of the total momentum that they change: the one across them."""
+        """Components (3,) of the total momentum that they change: the component across them."""
         return np.arange(3) == self.axis
 
     def behind(self, state: State) -> "SiteBehindWall | None":
-        """The site that is furthest behind a wall, or on it; None where all are before it."""
+        """The site that is furthest behind a wall, or on it; None if all are in front."""
         x = _across(self, state)
         if not len(x):
             return None
@@ -53,7 +53,7 @@ class LennardJonesWalls(NamedTuple):
 
 
 class HarmonicWalls(NamedTuple):
-    """Harmonic walls, which act on what is behind them only."""
+    """Harmonic walls, which act only on sites behind them."""
 
     axis: int
     lower: float
@@ -66,7 +66,7 @@ class HarmonicWalls(NamedTuple):
 
 
 class SiteBehindWall(NamedTuple):
-    """Where a site is behind a wall."""
+    """A site that is behind a wall."""
 
     molecule: int
     axis: int
@@ -88,7 +88,7 @@ def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
 
 
 def add_site_force(sites, state, load, m, i, axis, force):
-    """Add a force along an axis of the lab on site i of molecule m to the molecule's force and torque."""
+    """Add a force along a lab axis on site i of molecule m to the force and torque on the molecule."""
     raise TypeError("compiled code only")
 
 
@@ -104,7 +104,7 @@ def _add_site_force(sites, state, load, m, i, axis, force):
     def push_off_centre(sites, state, load, m, i, axis, force):
         load.force[m, axis] += force
         offset = sites.offset_body[sites.kind[m] - sites.first[m] + i]
-        row = state.rotation[m, axis]  # the lab's axis along those of the body
+        row = state.rotation[m, axis]  # the lab axis in the body frame
         for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
             load.torque_body[m, k] += force * (offset[a] * row[b] - offset[b] * row[a])

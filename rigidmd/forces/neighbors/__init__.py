@@ -13,19 +13,19 @@ The terms, from small to large, for vectors of 4 lanes (float64 with AVX2; float
 
     row       two slots (2r, 2r + 1) near one another; a cluster has 2 rows
     entry     a cluster and one periodic image of it, in a row: both sites of the row interact with its 4 sites
-    masked    an entry with lanes that do not count: sites of the same molecule, the cluster itself, padding at the end
-    shell     entries of a row at similar distance. Those of the first shell are within the cut-off when the list is
-              built; those of shell k may come within it once sites have moved by k/14 of the skin
+    masked    an entry with lanes that are left out: sites of the same molecule, the cluster itself, padding at the end
+    shell     entries of a row at similar distance. The first shell is within the cutoff when the list is built; shell k
+              may come within it once sites have moved by k/14 of the skin
 
         row r:   [ masked ... ] [ first shell | shell 1 | shell 2 | ... | shell 14 ]
-                                  ^ always      ^ the loop ends here, by how far sites have moved: `end_of_row`
+                                  ^ always      ^ the loop ends here, see `end_of_row`
 
-    block     a share of the clusters, with its rows, sums and entries. A thread takes a block at a time. The number of
-              blocks does not depend on that of threads, and sums are added in the order of blocks: the same bits
+    block     a range of clusters, with its rows, sums and entries. A thread takes one block at a time. Their number
+              does not depend on the number of threads, and sums are added in the order of blocks: the same bits
     ring      the clusters in order, with the first after the last. A pair of clusters is stored with the one from which
-              it is less than half a turn to the other, so each pair is stored once
+              it is less than half way round to the other, so each pair is stored once
 
-A list is valid as long as no site has moved by more than half the skin. `sites` and `space` say where things are,
+A list is valid as long as no site has moved by more than half the skin. `sites` and `space` have positions and cells,
 `clusters` sorts sites, `tree` finds clusters near one another, `lists` has the list, `update` rebuilds it, `rows` fills
-it, `loop` computes the forces.
+it, `pair_loop` computes the forces.
 """

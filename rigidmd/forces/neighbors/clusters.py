@@ -24,56 +24,48 @@ from rigidmd.compile.simd import (
 )
 from rigidmd.forces.neighbors.sites import index_of_x, locate_site, predict_site
 
-MAX_SERIAL_SITES = 128  # up to this number there is one block
+MAX_SERIAL_SITES = 128  # in one block
 
 
 class Clusters(NamedTuple):
-    """The sites of one potential in clusters. The last cluster is padded with copies of the last site."""
+    """The sites of one potential in clusters; the last cluster is padded with copies of the last site."""
 
     bounds: np.ndarray  # (blocks + 1,) block b has clusters bounds[b] ... bounds[b + 1] - 1
     slot: np.ndarray  # (s,) int32 the slot of each site
-    boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is moved back into the brick
+    boxes: np.ndarray  # (s, 3) int32 number of edges by which a site is shifted into the brick
     origin: np.ndarray  # (4 clusters,) x, y, z, 0 of each cluster, in the box, Å
     local: np.ndarray  # (3 slots,) positions relative to the origins, Å; scratch while sites are sorted
-    scratch: np.ndarray  # (3 slots,) the memory of the next three, which only a list that is being built needs
+    scratch: np.ndarray  # (3 slots,) memory of the next three, which are used only while a list is built
     order: np.ndarray  # (slots,) int32 the site in each slot
     group: np.ndarray  # (slots,) int32 group of the site in each slot
     half_square: np.ndarray  # (slots,) half the squares of `reference` as vectors, Å²
-    reference: np.ndarray  # (3 slots,) the places for which the sites were sorted, as `local`
+    reference: np.ndarray  # (3 slots,) the positions for which the sites were sorted, as `local`
     moved: np.ndarray  # (slots,) distance of each site from there, Å
     largest_displacement: np.ndarray  # (blocks,) the largest displacement, Å; infinite if it is too large for a list
-    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a share of molecules, Å
+    extent: np.ndarray  # (blocks, 6) lowest, highest x, y, z in the brick of the sites of a block of molecules, Å
 
 
 def clusters_of(sites: int, dtype: type) -> Clusters:
-    """Room for the clusters of this many sites, with positions of a NumPy dtype."""
+    """Arrays for the clusters of `sites` sites, with positions of a NumPy dtype."""
     width = lane_count(dtype)
     count = max(1, ceil(sites / width))
-    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cut-off. So the
-    # number of blocks grows as the edge of the box: memory for the sums is then in proportion to the sites.
+    # Each block has sums for the clusters that its rows reach, a layer of the box about as thick as the cutoff. The
+    # number of blocks grows like the edge of the box, so that the memory for the sums is proportional to the sites.
     blocks = min(max(BLOCKS, min(MOST_BLOCKS, int(0.2 * np.cbrt(sites)))), count) if sites > MAX_SERIAL_SITES else 1
     slots = count * width
     scratch = zeros(3 * slots, dtype)
     half_square, order, group = scratch.reshape(3, slots)
     return Clusters(
-        bounds=np.linspace(0, count, blocks + 1).astype(np.int64),
-        slot=np.zeros(sites, np.int32),
-        boxes=np.zeros((sites, 3), np.int32),
-        origin=zeros(4 * count, np.float64),
-        local=zeros(3 * slots, dtype),
-        scratch=scratch,
-        order=order.view(np.int32)[:slots],
-        group=group.view(np.int32)[:slots],
-        half_square=half_square,
-        reference=zeros(3 * slots, dtype),
-        moved=zeros(slots, dtype),
-        extent=np.zeros((blocks, 6)),
-        largest_displacement=np.zeros(blocks),
-    )
+        bounds=np.linspace(0, count, blocks + 1).astype(np.int64), slot=np.zeros(sites, np.int32),
+        boxes=np.zeros((sites, 3), np.int32), origin=zeros(4 * count, np.float64), local=zeros(3 * slots, dtype),
+        scratch=scratch, order=order.view(np.int32)[:slots], group=group.view(np.int32)[:slots],
+        half_square=half_square, reference=zeros(3 * slots, dtype), moved=zeros(slots, dtype),
+        extent=np.zeros((blocks, 6)), largest_displacement=np.zeros(blocks),
+    )  # fmt: skip
 
 
 def order_of(clusters: Clusters) -> np.ndarray:
-    """`Clusters.order` after the build, when its memory serves something else."""
+    """`Clusters.order` after the build, when its memory is used for something else."""
     order = np.empty_like(clusters.order)
     order[clusters.slot] = np.arange(len(clusters.slot))
     order[len(clusters.slot) :] = order[len(clusters.slot) - 1]
@@ -87,13 +79,13 @@ def _molecules_of_block(sites, blocks, block):
     return n * block // blocks, n * (block + 1) // blocks
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def wrap_sites_of_block(clusters, cell, sites, state, lead, largest_displacement, block):
-    """Places in the brick of the sites of a share of the molecules, for `bin_sites_of_block` into `local`, and their extent.
+    """Write positions in the brick of the sites of a block of molecules into `local`, for `bin_sites_of_block`.
 
     The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
-    places are those ahead by a time `lead`, see `predict_site`. The extent is NaN if a coordinate is farther from the
-    origin than `largest_displacement`, or is not finite.
+    positions are predicted for a time `lead` ahead, see `predict_site`. `extent` gets their extent, or NaN if a
+    coordinate is farther from the origin than `largest_displacement`, or is not finite.
     """
     extent, local = clusters.extent[block], clusters.local
     for k in range(3):
@@ -113,13 +105,11 @@ def wrap_sites_of_block(clusters, cell, sites, state, lead, largest_displacement
                 extent[3 + k] = max(extent[3 + k], local[3 * i + k])
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def bin_sites_of_block(clusters, sites, block):
-    """Bins of the sites of a share of the molecules, and heights within bins, into `slot` and `moved`.
-
-    Bins form columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that
-    begins in one column and ends in the next is compact too.
-    """
+    """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and `moved`. Bins form
+    columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that begins in
+    one column and ends in the next is compact too."""
     low, extent, (nx, ny, nz) = _bins(clusters)
     local = clusters.local
     first, end = _molecules_of_block(sites, len(clusters.extent), block)
@@ -150,7 +140,7 @@ def sort_into_clusters(clusters):
     for i in range(s):
         order[start[bin_of[i]]] = i
         start[bin_of[i]] += 1
-    # now start[p] is the end of bin p; the sites of a bin are few, and in the order of their indices
+    # now start[p] is the end of bin p; a bin has few sites, in the order of their indices
     for a in range(1, s):
         i = order[a]
         b = a
@@ -165,10 +155,8 @@ def sort_into_clusters(clusters):
 
 @kernel(inline=True)
 def _bins(clusters):
-    """Lowest corner of all sites in the brick, their extents, and the number of bins along each axis.
-
-    The first extent is NaN if there is none.
-    """
+    """Lowest corner of all sites in the brick, their extents, and the number of bins along each axis. The first extent
+    is NaN if there is none."""
     low, high = (inf, inf, inf), (-inf, -inf, -inf)
     lost = False
     for block in range(len(clusters.extent)):
@@ -186,7 +174,7 @@ def _bins(clusters):
 
 @kernel(inline=True)
 def _count_boxes(boxes, cell, i, at):
-    """Number of edges by which a site at (x, y, z) is moved back into the brick."""
+    """Write the number of edges by which a site at (x, y, z) is shifted into the brick."""
     x, y, z = at
     c = floor(z / cell[2, 2]) if cell[2, 2] < inf else 0.0
     if c != 0.0:
@@ -200,7 +188,7 @@ def _count_boxes(boxes, cell, i, at):
 
 @kernel(inline=True)
 def _in_brick(boxes, cell, i, at):
-    """Position of site i, at (x, y, z), after the shift that moved it into the brick when sites were sorted, Å."""
+    """Position of site i, at (x, y, z), with the shift into the brick of when sites were sorted, Å."""
     x, y, z = at
     back = boxes[np.uint64(i)]
     a, b, c = back[0], back[1], back[2]
@@ -218,9 +206,9 @@ def _bin(x, extent, count):
     return min(count - 1, int(x / extent * count)) if extent > 0 else 0
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def set_origins_of_block(clusters, cell, sites, state, lead, group, block):
-    """Origins and references of newly sorted clusters; the origin is the middle of the bounding box."""
+    """Set origins and references of newly sorted clusters; the origin is the centre of the bounding box."""
     width = lanes_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
@@ -250,22 +238,20 @@ def set_origins_of_block(clusters, cell, sites, state, lead, group, block):
 
 @kernel(inline=True)
 def _ahead_in_brick(clusters, cell, sites, state, i, lead):
-    """The place of site i for which sites are sorted, in the brick, Å."""
+    """The position of site i for which sites are sorted, in the brick, Å."""
     return _in_brick(clusters.boxes, cell, i, _ahead(sites, state, sites.molecule[i], i, lead))
 
 
 @kernel(inline=True)
 def _ahead(sites, state, m, i, lead):
-    """`predict_site`, or the present place, for which no velocity has to be a number."""
+    """`predict_site`; for lead = 0 the present position, which does not need finite velocities."""
     return predict_site(sites, state, m, i, lead) if lead != 0.0 else locate_site(sites, state, m, i)
 
 
 @kernel(inline=True)
 def _pair_up(order, at, width, first, end):
-    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one another.
-
-    `at` has their positions and is reordered with them.
-    """
+    """Reorder slots first ... end - 1 of a cluster so that the two sites of each row are near one another. `at` has
+    their positions and is reordered with them."""
     vectors = 2 * (first // width) * width
     for a in range(first, end - 2, 2):
         nearest, nearest2 = a + 1, inf
@@ -280,9 +266,9 @@ def _pair_up(order, at, width, first, end):
             at[n + a + 1], at[n + nearest] = at[n + nearest], at[n + a + 1]
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def restore_half_squares(clusters):
-    """Distances as `set_origins_of_block` left them, from order, origin and reference."""
+    """Set `half_square` as `set_origins_of_block` does, from the references."""
     width = lanes_of(clusters.local)
     for slot in range(len(clusters.order)):
         clusters.half_square[slot] = 0.0
@@ -290,12 +276,9 @@ def restore_half_squares(clusters):
             clusters.half_square[slot] += 0.5 * clusters.reference[n] ** 2
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def set_local_of_block(clusters, cell, sites, state, block):
-    """Set `local` of the sites of a share of the molecules to the present positions of the molecules.
-
-    The slots without a site stay at their references.
-    """
+    """Set `local` of the sites of a block of molecules to the present positions; padding stays at its reference."""
     width = lanes_of(clusters.local)
     local, origin = clusters.local, clusters.origin
     first, end = _molecules_of_block(sites, len(clusters.extent), block)
@@ -314,16 +297,16 @@ def set_local_of_block(clusters, cell, sites, state, block):
                 local[n] = clusters.reference[n]
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def use_present_as_reference(clusters):
-    """Let the present positions be the references. A skin may be smaller than the rounding between the two."""
+    """Use the present positions as references: a skin may be smaller than the rounding between the two."""
     for n in range(len(clusters.local)):
         clusters.reference[n] = clusters.local[n]
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def measure_displacements_of_block(clusters, limit, block):
-    """Displacements of the sites of a block: `moved`, and `largest_displacement`, infinite if one exceeds the limit."""
+    """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds the limit."""
     width = lanes_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1

@@ -1,20 +1,20 @@
-"""Neighbour lists: for each row of sites of one potential, the clusters that may hold a site inside the cut-off.
+"""Neighbour lists: for each row of sites of one potential, the clusters that may have a site within the cutoff.
 
-A row is two sites near one another, so whatever is loaded of a cluster serves both. The rows of a cluster meet much the
-same clusters: these are listed once, with the vectors between, and an entry of a row is a place in that list.
+A row is two sites near one another, so that what is loaded of a cluster serves both. The rows of a cluster have almost
+the same neighbours: these are listed once, with the vectors between origins, and an entry of a row is an index in that
+list.
 
-A list is built for places of the sites, and is valid while no site is farther from its own than half the skin. The
-engine checks this at every force evaluation, before it uses the list, so no pair is ever missed. The places are some
-steps ahead: the sites come nearer to them before they go away, and the list serves the longer. A box that has changed
-since the build has moved the images: that is taken from the skin. The clusters of each row are sorted into shells by
-distance. How far the sites are from their places tells how many shells can matter, so the loop works through a list
-whose sites are there as if it had no skin.
+A list is built for reference positions of the sites, and is valid while no site is farther from its reference than half
+the skin. The engine checks this at every force evaluation, before it uses the list, so it never misses a pair. The
+references are predicted positions, some steps ahead: sites first approach them, so the list is valid for longer. If the
+box has changed since the build, the displacement of the images is subtracted from the skin. The clusters of each row
+are sorted into shells by distance. The displacements of the sites determine how many shells can matter, so right after
+a build the loop does as much work as without a skin.
 
-Each pair of clusters is stored once, in a row of the cluster behind, with the clusters taken as a ring. The list is
-divided into blocks of rows, and any thread may fill any block: the list, and every sum over it, has the same bits for
-any number of threads.
+Each pair of clusters is stored once, with the clusters taken as a ring. The list is divided into blocks of rows, and
+any thread may fill any block: the list, and every sum over it, has the same bits for any number of threads.
 
-This file has the list itself and how it is read; `update` says when it is rebuilt, `rows` fills it.
+This module has the list and how it is read; `update` decides when it is rebuilt, `rows` fills it.
 """
 
 from math import ceil, inf, nan, pi
@@ -30,17 +30,15 @@ from rigidmd.forces.neighbors.clusters import Clusters, clusters_of, order_of
 from rigidmd.forces.neighbors.tree import BoxTree, empty_tree
 
 IMAGE_BITS = 6
-IMAGES = 1 << IMAGE_BITS  # enough for all images of a box within reach
-MAX_NEIGHBORS = 2**16  # clusters that the rows of one cluster can meet
+IMAGES = 1 << IMAGE_BITS  # largest number of images within reach
+MAX_NEIGHBORS = 2**16  # of one cluster
 MASK_BITS = 16  # of one site; no vector has more lanes
-SHELLS = 15  # the first: inside the cut-off when the list is built; the others divide the skin
+SHELLS = 15  # the first: inside the cutoff when the list is built; the others divide the skin
 MAX_BEYOND = 2**8 - 1
 LONGEST_SKIN = 0.45  # of the smallest edge
 ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 
-
-# Columns of PairList.needed and PairList.counters.
-# WINDOW: clusters behind those of the block, of which its rows reach the last.
+# Columns of PairList.needed and PairList.counters. WINDOW: number of clusters behind the block that its rows reach.
 ENTRIES, MASKED, NEIGHBORS, WINDOW, NEIGHBORS_OF_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
 BUILT, LEAD_TIME = 0, 1  # of PairList.times
@@ -49,14 +47,14 @@ BUILT, LEAD_TIME = 0, 1  # of PairList.times
 class PairList(NamedTuple):
     """Rows of clusters for the sites of one potential.
 
-    Cluster c meets the images neighbors[b, first:end] of clusters: b its block, end = near[c], first = near[c - 1], or 0 for
-    the first cluster of a block. An image is the integer IMAGES * cluster + number; `shift` has its displacement. An
-    entry of a row is a place among what its cluster meets.
+    Cluster c of block b has the neighbours neighbors[b, first:end] with end = neighbor_end[c], first =
+    neighbor_end[c - 1], or 0 for the first cluster of a block. A neighbour is an image of a cluster, stored as the
+    integer IMAGES * cluster + image number; `shift` has its displacement. An entry of a row is an index in these.
     """
 
     cutoff: float  # Å
     skin: float  # Å
-    shells_per_A: float  # beyond the cut-off
+    shells_per_A: float  # beyond the cutoff
     reach2: float  # square of the largest distance between sites of one group, Å²; may be infinite
     group: np.ndarray  # (s,) group of each site; pairs inside one group are excluded
     cell: np.ndarray  # (3, 3) the cell at the last use, Å
@@ -65,24 +63,18 @@ class PairList(NamedTuple):
     tree: BoxTree
     multiple: np.ndarray  # (IMAGES, 3) int32 edges a, b, c by which each image is displaced
     shift: np.ndarray  # (4 * IMAGES,) x, y, z, 0 of each image, Å
-    slack: np.ndarray  # (1,) the farthest that an image has moved since the list was built, Å
-    row_end: (
-        np.ndarray
-    )  # (rows,) int32 end in entries[b] of row r, which has slots 2 r and 2 r + 1; row r + 1 begins there
-    beyond: np.ndarray  # (rows, SHELLS) uint8 how many entries at the end of a row are beyond shell k
+    slack: np.ndarray  # (1,) the largest displacement of an image since the list was built, Å
+    row_end: np.ndarray  # (rows,) int32 end in entries[b] of row r (slots 2 r and 2 r + 1); row r + 1 begins there
+    beyond: np.ndarray  # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
     masked_end: np.ndarray  # (rows,) int32 end of each row in masked[b]
-    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that count for each site of the row, as bits
+    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that interact with each site, as bits
     neighbor_end: np.ndarray  # (clusters,) int32
     neighbors: np.ndarray  # (blocks, capacity) int32
-    origin_vector: (
-        np.ndarray
-    )  # (blocks, 3 capacity) from the origins of what is neighbors to that of c, Å; (blocks, 0) in float64
-    needed: (
-        np.ndarray
-    )  # (blocks, 5) capacity expected or needed: entries, masked, neighbors, clusters behind, neighbors by one
-    counters: np.ndarray  # (4,) usable (0 or 1), number of builds, status of the last update, number of images
-    times: np.ndarray  # (2,) when the list was built, NaN before; how far ahead the places are for which it was; ps
+    origin_vector: np.ndarray  # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
+    needed: np.ndarray  # (blocks, 5) capacity expected or needed: ENTRIES, MASKED, ... NEIGHBORS_OF_ONE
+    counters: np.ndarray  # (4,) valid (0 or 1), number of builds, status of the last update, number of images
+    times: np.ndarray  # (2,) time of the build, NaN before the first; lead time of the references; ps
 
 
 @kernel(inline=True)
@@ -93,13 +85,13 @@ def cluster_of(image):
 
 @kernel(inline=True)
 def image_number(image):
-    """The number of an image."""
+    """The image number, an index into `shift`."""
     return image & (IMAGES - 1)
 
 
 @kernel(inline=True)
 def behind_block(bounds, block, cluster):
-    """How many clusters there are on the ring from the end of a block to a cluster; -1 for a cluster of the block."""
+    """Number of clusters on the ring from the end of a block to a cluster; -1 for a cluster of the block."""
     first, end = bounds[block], bounds[block + 1]
     if first <= cluster < end:
         return -1
@@ -107,11 +99,8 @@ def behind_block(bounds, block, cluster):
 
 
 def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float, skin: float, dtype: type) -> PairList:
-    """A list that is built at its first use, with about the capacity that evenly spread sites would need.
-
-    cell : (3, 3)
-    reach : largest distance between sites of one group, Å; infinite if it is not known
-    """
+    """A list that is built at its first use, with the capacity that evenly distributed sites need. cell : (3, 3). reach
+    : largest distance between sites of one group, Å; infinite if it is not known"""
     clusters = clusters_of(len(group), dtype)
     blocks, slots = len(clusters.largest_displacement), len(clusters.order)
     rows = slots // 2
@@ -122,49 +111,33 @@ def empty_list(cell: np.ndarray, group: np.ndarray, reach: float, cutoff: float,
     needed = np.zeros((blocks, 5), np.int64)
     needed[:, WINDOW] = _expected_window(cell, count, blocks, cutoff + skin)
     skin = _fitting_skin(cell, cutoff, skin)
+    # masked entries per row, measured: argon 1.1, water 1.5
     return PairList(
-        cutoff=cutoff,
-        skin=skin,
-        shells_per_A=(SHELLS - 1) / skin,
-        reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
-        group=group,
-        cell=cell.copy(),
-        built=cell.copy(),
-        clusters=clusters,
-        tree=empty_tree(count),
-        multiple=np.zeros((IMAGES, 3), np.int32),
-        shift=zeros(4 * IMAGES, np.float64),
-        slack=np.zeros(1),
-        row_end=np.zeros(rows, np.int32),
-        beyond=np.zeros((rows, SHELLS), np.uint8),
-        entries=np.empty((blocks, capacity), np.uint16),
-        masked_end=np.zeros(rows, np.int32),
-        masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32),  # measured per row: argon 1.1, water 1.5
-        neighbor_end=np.zeros(count, np.int32),
+        cutoff=cutoff, skin=skin, shells_per_A=(SHELLS - 1) / skin, reach2=(reach + ROUNDING * (cutoff + skin)) ** 2,
+        group=group, cell=cell.copy(), built=cell.copy(), clusters=clusters, tree=empty_tree(count),
+        multiple=np.zeros((IMAGES, 3), np.int32), shift=zeros(4 * IMAGES, np.float64), slack=np.zeros(1),
+        row_end=np.zeros(rows, np.int32), beyond=np.zeros((rows, SHELLS), np.uint8),
+        entries=np.empty((blocks, capacity), np.uint16), masked_end=np.zeros(rows, np.int32),
+        masked=np.empty((blocks, ceil(1.5 * most_rows), 2), np.int32), neighbor_end=np.zeros(count, np.int32),
         neighbors=np.empty((blocks, neighbors), np.int32),
-        origin_vector=_origin_vector_buffer(blocks, neighbors, dtype),
-        needed=needed,
-        counters=np.zeros(4, np.int64),
+        origin_vector=_origin_vector_buffer(blocks, neighbors, dtype), needed=needed, counters=np.zeros(4, np.int64),
         times=np.array([nan, 0.0]),
-    )
+    )  # fmt: skip
 
 
 def _origin_vector_buffer(blocks: int, neighbors: int, dtype: type) -> np.ndarray:
-    """Room for `PairList.origin_vector`. In float64 it would be larger than all else, and save no time."""
+    """An array for `PairList.origin_vector`; empty in float64, where it would need much memory and save no time."""
     return np.empty((blocks, 3 * neighbors if dtype == np.float32 else 0), dtype)
 
 
 def _fitting_skin(cell: np.ndarray, cutoff: float, skin: float) -> float:
-    """The skin, shortened if second images could come near between builds; IMAGES would then not be enough."""
+    """The skin, shortened if second images could come within reach between builds, for which IMAGES is too small."""
     return min(skin, LONGEST_SKIN * cell.diagonal().min()) if cutoff < inf else inf
 
 
 def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float) -> float:
-    """Expected number of clusters within a radius of sites, half of them; 0 if the density is not known, and the first
-    build then finds it.
-
-    size : 1 for a row, which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7
-    """
+    """Half the expected number of clusters within a radius of sites; 0 if the density is not known. size : 1 for a row,
+    which is small, 1.75 for a whole cluster: water needs 1.6 to 1.7"""
     if radius == inf:
         return count / 2 + 1
     volume = cell.diagonal().prod()
@@ -177,7 +150,7 @@ def _expected_neighbors(cell: np.ndarray, count: int, radius: float, size: float
 
 
 def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -> int:
-    """Expected number of clusters behind a block of which its rows reach the last."""
+    """Expected number of clusters behind a block that its rows reach."""
     volume = cell.diagonal().prod()
     if volume == inf or radius == inf:
         return 0
@@ -185,12 +158,12 @@ def _expected_window(cell: np.ndarray, count: int, blocks: int, radius: float) -
     return min(count - count // blocks, ceil(count * min(layers, 0.5)))
 
 
-#: Arrays of `Clusters` from which a list is built again as it was, besides the order of the sites.
+#: Arrays of `Clusters` from which the same list is built again, besides the order of the sites.
 CHECKPOINTED = ("boxes", "origin", "reference")
 
 
 def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
-    """What `restored` needs to have this list again, bit for bit, where sites have moved since it was built."""
+    """The arrays from which `restored` makes this list again, bit for bit, although sites have moved since."""
     found = {"skin": np.array(pairs.skin)}
     if pairs.counters[USABLE] == 1:
         found |= {name: getattr(pairs.clusters, name) for name in CHECKPOINTED}
@@ -199,11 +172,8 @@ def checkpoint_arrays(pairs: PairList) -> dict[str, np.ndarray]:
 
 
 def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: float, now: float) -> PairList:
-    """The new list with the clusters and the skin of a arrays; `update.refill` must follow if there are clusters.
-
-    requested_skin : the skin that was requested_skin for, Å. now : the present time, ps
-    Raises ValueError if the arrays is that of no such list.
-    """
+    """The new list with the clusters and the skin of a checkpoint; `update.refill` must follow if there are clusters.
+    requested_skin : in Å. now : the present time, ps. Raises ValueError if the arrays do not fit such a list."""
     clusters, cell = pairs.clusters, pairs.cell
     like = {name: getattr(clusters, name) for name in (*CHECKPOINTED, "order")}
     like |= {"built": pairs.built, "times": pairs.times}
@@ -240,25 +210,22 @@ def restored(pairs: PairList, arrays: dict[str, np.ndarray], requested_skin: flo
 
 
 def with_capacity(pairs: PairList, cell: np.ndarray) -> PairList:
-    """The list with the capacity that its last build needed and a tenth more, and with a skin that fits into the cell.
-
-    Raises SimulationError if the cell has become too small for the cut-off, or too many sites are within it.
-    """
+    """The list with the capacity that its last build needed and a tenth more, and a skin that fits into the cell.
+    Raises SimulationError if the cell has become too small for the cutoff, or too many sites are within it."""
     if pairs.counters[STATUS] == CELL_CHANGED:
         if 2 * pairs.cutoff > cell.diagonal().min():
             raise SimulationError(
-                f"the box has become too small for the cut-off of {pairs.cutoff:g} Å: half its smallest edge is "
-                f"{cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or take a shorter cut-off"
+                f"the box has become too small for the cutoff of {pairs.cutoff:g} Å: half its smallest edge is "
+                f"{cell.diagonal().min() / 2:.4g} Å. Begin with a larger box, or take a shorter cutoff"
             )
         skin = _fitting_skin(cell, pairs.cutoff, pairs.skin)
         pairs = pairs._replace(skin=skin, shells_per_A=(SHELLS - 1) / skin)
     blocks = len(pairs.needed)
     entries, masked, neighbors, _, of_one = pairs.needed.max(axis=0)
     if of_one > MAX_NEIGHBORS:
-        raise SimulationError(
-            f"more than {MAX_NEIGHBORS * lane_count(pairs.origin_vector.dtype)} sites are within the cut-off of {pairs.cutoff:g} Å: "
-            "take a shorter one, or fewer molecules"
-        )
+        sites = MAX_NEIGHBORS * lane_count(pairs.origin_vector.dtype)
+        why = f"more than {sites} sites are within the cutoff of {pairs.cutoff:g} Å"
+        raise SimulationError(f"{why}: take a shorter one, or fewer molecules")
     if entries > pairs.entries.shape[1]:
         pairs = pairs._replace(entries=np.empty((blocks, int(1.1 * entries) + 16), np.uint16))
     if masked > pairs.masked.shape[1]:
@@ -281,7 +248,7 @@ def most_needed(pairs, k):
 
 @kernel(inline=True)
 def largest_displacement(pairs):
-    """The largest distance of any site's image from its place in the list, Å; infinite if the list is not valid."""
+    """The largest displacement of an image of a site from its reference, Å; infinite if the list is not valid."""
     found = 0.0
     for block in range(len(pairs.needed)):
         found = max(found, pairs.clusters.largest_displacement[block])
@@ -290,7 +257,7 @@ def largest_displacement(pairs):
 
 @kernel(inline=True)
 def end_of_row(pairs, r, largest_displacement):
-    """End of the entries of row r that can hold a site inside the cut-off; `largest_displacement` as above, Å."""
+    """End of the entries of row r that can have a site inside the cutoff; `largest_displacement` as above, Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
     shell = min(SHELLS - 1, ceil((moved + largest_displacement) * pairs.shells_per_A))
     return pairs.row_end[r] - pairs.beyond[r, shell]
@@ -298,11 +265,11 @@ def end_of_row(pairs, r, largest_displacement):
 
 @kernel(inline=True)
 def lanes_of_first(bits):
-    """The lanes of a masked entry that count for the first site of the row, as bits."""
+    """The lanes of a masked entry that interact with the first site of the row, as bits."""
     return bits & ((1 << MASK_BITS) - 1)
 
 
 @kernel(inline=True)
 def lanes_of_second(bits):
-    """The lanes of a masked entry that count for the second site of the row, as bits."""
+    """The lanes of a masked entry that interact with the second site of the row, as bits."""
     return bits >> MASK_BITS

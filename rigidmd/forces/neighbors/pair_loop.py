@@ -1,6 +1,6 @@
-"""Forces between pairs of sites: the one loop for every such potential.
+"""Forces between pairs of sites: the one loop for every pair potential.
 
-A potential gives only the energy and force between one site and a vector of forces_behind at given distances, by an
+A potential computes only the energy and force between one site and a vector of others at given distances, by an
 `@implements(pair)` for its NamedTuple, and puts its numbers for each site into the order of the slots (`arrange`). This
 loop finds the pairs and their images, sums energies, virial and forces, and adds the forces to the bodies.
 """
@@ -65,26 +65,23 @@ from rigidmd.forces.terms import Setup
 
 
 class PairSums(NamedTuple):
-    """Sums of forces and energies."""
+    """Sums of forces and energies, and scratch."""
 
-    forces: np.ndarray  # (3 slots,) force on each site from the rows of its block, then from all; as Clusters.local
-    forces_behind: np.ndarray  # (blocks, room) forces of a block's rows on the clusters behind the block
-    force_at_change: (
-        np.ndarray
-    )  # (blocks, 3 lanes) force on a row when the image of its entries changed last, see `_change_image`
+    forces: np.ndarray  # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
+    forces_behind: np.ndarray  # (blocks, capacity) forces from the rows of a block on the clusters behind it
+    force_at_change: np.ndarray  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
 
 
 class PairForces(NamedTuple):
-    """A pair potential and the sites that take part in it."""
+    """A pair potential between sites."""
 
     potential: NamedTuple  # its arrays are in the order of the sites
     sites: BodySites | CentralSites
     group: np.ndarray  # (s,) sites of one group do not interact
 
     def workspace(self, setup: Setup) -> "PairWorkspace":
-        """Room for a neighbour list, which is built at its first use, and for sums."""
         potential, sites = self.potential, self.sites
         reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf
         pairs = empty_list(setup.cell, self.group, reach, potential.cutoff, setup.skin, setup.dtype)
@@ -101,30 +98,25 @@ class PairForces(NamedTuple):
 
 
 class PairWorkspace(NamedTuple):
-    """Workspace of a `PairForces`."""
-
     potential: NamedTuple
-    slot_potential: (
-        NamedTuple  # what the loop reads: the potential's numbers in the order of slots, in the precision of lanes
-    )
+    slot_potential: NamedTuple  # the numbers of the potential in the order of slots, in the precision of the loop
     sites: BodySites | CentralSites
     pairs: PairList
     sums: PairSums
-    with_energies: np.ndarray | None  # (1,) of the loader; None where virials are never asked for without them
+    with_energies: np.ndarray | None  # (1,) of the `TermTable`; None if virials are never needed without energies
     list_code: Code | None = None
     code: Code | None = None
 
     @property
     def scratch(self) -> np.ndarray:
-        """The array that it needs only while its forces are computed."""
+        """The array that is used only while forces are computed."""
         return self.sums.forces_behind
 
     def with_scratch(self, arrays: np.ndarray) -> "PairWorkspace":
-        """With that array in arrays of the same type, which may be larger."""
+        """With this array of the same type, which may be larger, as scratch."""
         forces_behind = self.sums.forces_behind
-        return self._replace(
-            sums=self.sums._replace(forces_behind=arrays.reshape(-1)[: forces_behind.size].reshape(forces_behind.shape))
-        )
+        forces_behind = arrays.reshape(-1)[: forces_behind.size].reshape(forces_behind.shape)
+        return self._replace(sums=self.sums._replace(forces_behind=forces_behind))
 
     @property
     def site_force(self) -> np.ndarray:
@@ -137,28 +129,24 @@ class PairWorkspace(NamedTuple):
         return InSlots(self.sums.forces, self.pairs.clusters.slot)
 
     def with_code(self) -> "PairWorkspace":
-        """With the machine code that finds pairs and computes their forces."""
+        """With machine code."""
         state, load = EXAMPLE
-        lists = list_code(self.pairs, self.sites)
+        list_tasks = list_code(self.pairs, self.sites)
         content = (self.slot_potential, self.pairs, self.sums)
+        whole = (list_tasks, self.potential, self.slot_potential, self.sites, self.pairs, self.sums, state)
         pressed = {} if self.with_energies is None else {"forces_and_virial": (_forces_and_virial, content)}
         code = Code(
-            update=(
-                _update_pairs,
-                (lists, self.potential, self.slot_potential, self.sites, self.pairs, self.sums, state),
-            ),
-            forces=(_forces, content),
+            update=(_update_pairs, whole), forces=(_forces, content),
             forces_and_energies=(_forces_and_energies, content),
-            gather=(_gather, content),
-            gather_with_virial=(_gather_with_virial, content),
+            gather=(_gather, content), gather_with_virial=(_gather_with_virial, content),
             load=(load_block, (self.sites, state, load, self.forces_in_slots)),
             offset_virial=(add_offset_virial_of_block, (self.sites, state, self.forces_in_slots, self.sums.virial)),
             **pressed,
-        )
-        return self._replace(code=code, list_code=lists)
+        )  # fmt: skip
+        return self._replace(code=code, list_code=list_tasks)
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
-        """With the room that the last build of the list needed."""
+        """With the capacity that the last build of the list needed."""
         pairs = lists.with_capacity(self.pairs, cell)
         forces_behind, clusters = self.sums.forces_behind, int(pairs.needed[:, WINDOW].max())
         if 3 * lane_count(forces_behind.dtype) * clusters > forces_behind.shape[1]:
@@ -166,11 +154,10 @@ class PairWorkspace(NamedTuple):
         return self._replace(pairs=pairs, sums=self.sums._replace(forces_behind=forces_behind))
 
     def checkpoint_arrays(self) -> dict[str, np.ndarray]:
-        """Its list as last built."""
         return lists.checkpoint_arrays(self.pairs)
 
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
-        """With the list of these arrays, ready to use (machine code is there). Raises ValueError if they are of another term."""
+        """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not fit this term."""
         found = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
         while "order" in arrays and _refill(found):
             found = found.with_capacity(found.pairs.cell)
@@ -183,12 +170,12 @@ def _buffer_behind(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
 
 
 def pair_forces(potential: NamedTuple, sites: BodySites | CentralSites, group: np.ndarray | None = None) -> PairForces:
-    """The term of a potential with a `cutoff`; without groups, sites of one molecule do not interact."""
+    """The term of a potential with a `cutoff`; by default, sites of one molecule do not interact."""
     return PairForces(potential, sites, sites.molecule if group is None else group)
 
 
 def _diameter(sites: BodySites | CentralSites) -> float:
-    """An upper bound on the distance between sites of a molecule, Å: the longest diagonal of boxes around them."""
+    """An upper limit of the distance between sites of a molecule, Å: the longest diagonal of boxes around them."""
     if not isinstance(sites, BodySites) or not len(sites.molecule):
         return 0.0
     starts, offsets = np.unique(sites.kind[np.diff(sites.first) > 0]), sites.offset_body
@@ -198,14 +185,12 @@ def _diameter(sites: BodySites | CentralSites) -> float:
 
 def pair(potential, i, j, r2):
     """(energy, force/r) of the site in slot i with those in slots j, j + 1, ... at squared distances r2, as vectors.
-
-    Valid below cutoff²; a positive force repels.
-    """
+    Valid below cutoff²; a positive force repels."""
     raise TypeError(f"{type(potential).__name__} is not a pair potential, or this was called outside compiled code")
 
 
 def arrange(potential, slot_potential, order):
-    """Fill the numbers that an slot_potential potential has for each slot with those of the site now in that slot."""
+    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in each slot."""
     raise TypeError("compiled code only")
 
 
@@ -216,14 +201,11 @@ def into_slots(of_sites, in_slots, order):
         in_slots[slot] = of_sites[i]
 
 
-@implements(terms.add_forces, PairWorkspace, counted=False)
+@implements(terms.add_forces, PairWorkspace, count_references=False)
 def _add_pair_forces(term, state, load, tally):
     code, pairs, sums = term.code, term.pairs, term.sums
-    call(
-        code,
-        "update",
-        pack_arguments((term.list_code, term.potential, term.slot_potential, term.sites, pairs, sums, state)),
-    )
+    everything = (term.list_code, term.potential, term.slot_potential, term.sites, pairs, sums, state)
+    call(code, "update", pack_arguments(everything))
     if pairs.counters[STATUS] != OK:
         return pairs.counters[STATUS]
     arguments = pack_arguments((term.slot_potential, pairs, sums))
@@ -245,7 +227,7 @@ def _add_pair_forces(term, state, load, tally):
 
 
 def _call_tallied(with_energies, code, arguments, blocks):
-    """Call the task that also finds virials, and energies if they are wanted."""
+    """Call the task that also computes virials, and energies if they are needed."""
     raise TypeError("compiled code only")
 
 
@@ -267,7 +249,7 @@ def _call_with_energies(with_energies, code, arguments, blocks):
 
 @task()
 def _update_pairs(arguments, block):
-    """Update the list, and the potential's numbers in slots, for the present state; a status code into counters[STATUS]."""
+    """Update the list, and the numbers of the potential in slots; a status code into counters[STATUS]."""
     code, potential, slot_potential, sites, pairs, sums, state = load_arguments(arguments)
     builds = pairs.counters[BUILDS]
     status = update_list(pairs, code, sites, state)
@@ -278,7 +260,7 @@ def _update_pairs(arguments, block):
 
 @kernel
 def _arrange_potential(potential, slot_potential, pairs, sums):
-    """Put the potential's numbers into the slots of a new list; a status code."""
+    """Put the numbers of the potential into the slots of a new list; a status code."""
     arrange(potential, slot_potential, pairs.clusters.order)
     if 3 * lanes_of(sums.forces_behind) * most_needed(pairs, WINDOW) > sums.forces_behind.shape[1]:
         pairs.counters[USABLE] = 0
@@ -286,7 +268,7 @@ def _arrange_potential(potential, slot_potential, pairs, sums):
     return OK
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _refill(term):
     """Build a list again from its clusters; a status code, also in counters[STATUS]."""
     pairs = term.pairs
@@ -297,54 +279,54 @@ def _refill(term):
     return status
 
 
-@task(counted=False)
+@task(count_references=False)
 def _forces(arguments, block):
     potential, pairs, sums = load_arguments(arguments)
     block_forces(potential, pairs, sums, None, None, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _forces_and_energies(arguments, block):
     potential, pairs, sums = load_arguments(arguments)
     block_forces(potential, pairs, sums, sums.tallies, sums.tallies, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _forces_and_virial(arguments, block):
     potential, pairs, sums = load_arguments(arguments)
     block_forces(potential, pairs, sums, sums.tallies, None, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _gather(arguments, block):
     _, pairs, sums = load_arguments(arguments)
     gather_block(pairs, sums.forces, sums.forces_behind, None, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _gather_with_virial(arguments, block):
     _, pairs, sums = load_arguments(arguments)
     gather_block(pairs, sums.forces, sums.forces_behind, sums.tallies, block)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def block_forces(potential, pairs, into, tallies, energies, block):
-    """Forces from the rows of one block: on the sites of the block into `forces`, on those behind it into `forces_behind`.
+    """Forces from the rows of one block: on the sites of the block into `forces`, on others into `forces_behind`.
 
     into : `PairSums`. tallies : (blocks, 10) for a part of the virial, or None. energies : the same array, or None
 
-    The distance of two sites is the difference of their places in the box, less the shift of an image. So the virial is
-    the sum over sites of f (x) place, see `gather_block`, less that over entries of the force on the row (x) shift.
-    The latter is summed here where the image changes along a row. That is seldom: in each shell the entries of one
-    image follow one another, and rows far from the edges meet no other image.
+    The distance of two sites is the difference of their positions in the box, less the shift of an image. So the virial
+    is the sum over sites of f (x) position, see `gather_block`, less the sum over entries of the force on the row (x)
+    shift. The latter is added here when the image changes along a row. That is seldom: in each shell the entries of one
+    image are consecutive, and rows far from the edges have no other image.
     """
     align_stack()
     clusters = pairs.clusters
     width = lanes_of(clusters.local)
-    forces, forces_behind, force_at_change = into.forces, into.forces_behind[block], into.force_at_change[block]
+    forces, behind, force_at_change = into.forces, into.forces_behind[block], into.force_at_change[block]
     bounds = (clusters.bounds[block], clusters.bounds[block + 1])
     forces[3 * width * bounds[0] : 3 * width * bounds[1]] = 0.0
-    forces_behind[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
+    behind[: 3 * width * pairs.needed[block, WINDOW]] = 0.0
     if tallies is not None:
         tallies[block] = 0.0
     entries = pairs.entries[block]
@@ -367,11 +349,9 @@ def block_forces(potential, pairs, into, tallies, energies, block):
                 if tallies is not None:
                     number = _change_image(pairs, number, image_number(image), sums, force_at_change, tallies[block])
                 masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
-                sums = _interact(
-                    potential, pairs, bounds, i, other, between, masks, forces, forces_behind, sums, energies
-                )
-            # Displacements are computed one entry ahead: instructions that wait for them would otherwise fill the
-            # processor's queues force_at_change those of the next entry could enter.
+                sums = _interact(potential, pairs, bounds, i, other, between, masks, forces, behind, sums, energies)
+            # Displacements are computed one entry ahead: otherwise instructions that wait for them fill the queues of
+            # the processor before instructions of the next entry can enter.
             last = end_of_row(pairs, i // 2, moved) - 1
             other = image = np.int32(0)
             between = ((zero, zero, zero, zero), (zero, zero, zero, zero))
@@ -385,9 +365,8 @@ def block_forces(potential, pairs, into, tallies, energies, block):
                 )
                 if tallies is not None:
                     number = _change_image(pairs, number, image_number(image), sums, force_at_change, tallies[block])
-                sums = _interact(
-                    potential, pairs, bounds, i, other, between, (None, None), forces, forces_behind, sums, energies
-                )
+                unmasked = (None, None)
+                sums = _interact(potential, pairs, bounds, i, other, between, unmasked, forces, behind, sums, energies)
                 other, image, between = ahead, its_image, after
             if tallies is not None:
                 _change_image(pairs, number, 0, sums, force_at_change, tallies[block])
@@ -401,11 +380,8 @@ def block_forces(potential, pairs, into, tallies, energies, block):
 
 @kernel(inline=True)
 def _change_image(pairs, number, now, sums, force_at_change, tally):
-    """Go from entries of one image, if it is another one, to those of the next; returns its number.
-
-    The force on the row since the last change (x) the shift of the image is subtracted from the tally; `force_at_change` has the
-    force on the row at that change.
-    """
+    """Account for the shift of an image, if the next entry has another image; returns the next image number. The force
+    on the row since the last change (x) the shift of the image is subtracted from the tally."""
     if now != number:
         width = lanes_of(force_at_change)
         on_one, on_two, _ = sums
@@ -424,17 +400,15 @@ def _change_image(pairs, number, now, sums, force_at_change, tally):
 
 @kernel(inline=True)
 def _add_symmetric_virial(tally, virial):
-    """Add the six numbers of a symmetric virial to the nine of a tally."""
+    """Add a symmetric virial (six numbers) to the nine numbers of a tally."""
     for k, of in enumerate((0, 1, 2, 1, 3, 4, 2, 4, 5)):
         tally[1 + k] += virial[of]
 
 
 @kernel(inline=True)
 def _displacements(pairs, c, here, neighbors, origin_vector, number):
-    """The cluster and the image neighbors by an entry, and displacements from its sites, as vectors, to each of two of c.
-
-    These are as of `_separation`.
-    """
+    """The cluster and the image of an entry, and displacements from its sites, as vectors, to the two sites of the row.
+    The displacements are as in `_separation`."""
     local = pairs.clusters.local
     width = lanes_of(local)
     image = load_scalar(neighbors, number)
@@ -448,10 +422,8 @@ def _displacements(pairs, c, here, neighbors, origin_vector, number):
 
 
 def load_origin_vector(pairs, c, neighbors, origin_vector, number):
-    """Vector from the origin of what is neighbors to that of cluster c, Å.
-
-    In single precision it is looked up: to compute it would take a sixth of the time of all pairs.
-    """
+    """Vector from the origin of a neighbour to the origin of cluster c, Å. In single precision it is stored: to compute
+    it would take a sixth of the time of all pairs."""
     raise TypeError("compiled code only")
 
 
@@ -491,11 +463,9 @@ def _separation(here, x, y, z):
 
 @kernel(inline=True)
 def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces_behind, sums, energies):
-    """Forces between the sites in slots i, i + 1 and those of a cluster, added to `sums` and, if the cluster is of the
-    block, to `forces`, else to `forces_behind`; energies too.
-
-    energies : None if they are not wanted. bounds : of the block, see `Clusters`
-    """
+    """Forces between the sites in slots i, i + 1 and those of a cluster, and energies unless None. They are added to
+    `sums` and to `forces`, or to `forces_behind` if the cluster is not in the block. bounds : of the block, see
+    `Clusters`"""
     width = lanes_of(pairs.clusters.local)
     on_one, on_two, energy = sums
     ax, ay, az, _ = between[0]
@@ -508,7 +478,7 @@ def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces
     if (other >= first) & (other < end):
         at, there = other, forces
     at = 3 * width * at
-    # Each product is in one expression with the sum to which it is added, so that the two are one multiply-add.
+    # Each product is in one expression with the sum to which it is added, so that they become one multiply-add.
     store(there, at, load(there, at) - one * ax - two * bx)
     store(there, at + width, load(there, at + width) - one * ay - two * by)
     store(there, at + 2 * width, load(there, at + 2 * width) - one * az - two * bz)
@@ -521,7 +491,7 @@ def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces
 
 @kernel(inline=True)
 def _with_product(virial, force, at):
-    """A symmetric virial, six vectors, with force (x) place added."""
+    """A symmetric virial, six vectors, with force (x) position added."""
     x, y, z = force
     return (
         virial[0] + x * at[0],
@@ -543,13 +513,11 @@ def _masked_pair(potential, i, j, r2, mask):
     return select(counts, w, 0.0), select(counts, u, 0.0)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def gather_block(pairs, forces, forces_behind, tallies, block):
-    """Forces on the sites of a block from its forces rows and from those of other blocks, added in a fixed order.
-
-    With tallies, the rest of the virial is added: the sum over sites of f (x) place. All forces add up to zero, so that
-    places may be relative to a cluster of the system: where they are small, so is what rounding of forces does.
-    """
+    """Forces on the sites of a block from its rows and from those of other blocks, added in a fixed order. With
+    tallies, the rest of the virial is added: the sum over sites of f (x) position. All forces add up to zero, so
+    positions may be relative to any cluster: with small positions, the rounding error of forces has little effect."""
     clusters = pairs.clusters
     origin = clusters.origin
     middle = 4 * (len(origin) // 8)

@@ -11,8 +11,8 @@ from rigidmd.compile.simd import (  # fmt: skip
     lanes_of,
     load,
     load_broadcast,
-    load_converted,
     load_scalar,
+    load_with_lanes_of,
     mask_bits,
     maximum,
     minimum,
@@ -38,8 +38,8 @@ from rigidmd.forces.neighbors.lists import (  # fmt: skip
 )
 from rigidmd.forces.neighbors.tree import ahead, families_within_reach, near
 
-OUT_OF_REACH = SHELLS  # where a candidate counts that a row does not meet, after the shells
-NEEDS_MASK = SHELLS + 1  # where one counts that needs a mask
+OUT_OF_REACH = SHELLS  # kind of a candidate that a row does not need; kinds below are shells
+NEEDS_MASK = SHELLS + 1  # kind of a candidate that needs a mask
 KINDS = SHELLS + 2
 
 
@@ -47,13 +47,13 @@ class Scratch(NamedTuple):
     """Scratch arrays for the rows of one cluster."""
 
     stack: np.ndarray  # (levels, 2) for families_within_reach
-    low: np.ndarray  # (3,) a box, moved by an image
+    low: np.ndarray  # (3,) of a box, shifted by an image
     high: np.ndarray  # (3,)
     family: np.ndarray  # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
-    candidate: np.ndarray  # (capacity + arity,) images of clusters that may be count, at last those that are
+    candidate: np.ndarray  # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
     close: np.ndarray  # (capacity,) those of them that may need a mask
     kind: np.ndarray  # (capacity * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
-    kind_end: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind; then where the next of them goes
+    kind_end: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind, later the index of the next one
     sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
@@ -68,7 +68,7 @@ def _new_scratch(pairs, capacity):
         np.empty(capacity, np.int64),
         np.empty(capacity + lanes_of(pairs.tree.low), np.int64),
         np.empty(capacity, np.int64),
-        np.empty(rows * (capacity + 1), np.uint8),  # one more, since what no row has is written too
+        np.empty(rows * (capacity + 1), np.uint8),  # one more, since a candidate that no row needs is written too
         np.empty((rows, KINDS), np.uint32),  # unsigned: no index is checked for being negative
         np.empty((rows, capacity), np.uint16),
         np.zeros(5, np.int64),
@@ -77,10 +77,8 @@ def _new_scratch(pairs, capacity):
 
 @kernel(inline=True)
 def fill_block(pairs, block, capacity):
-    """Fill the rows of one block. Entries beyond the capacity are counted but not stored.
-
-    Returns 0, or the capacity needed for candidates if it is too small; the rows are then incomplete.
-    """
+    """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns 0, or the capacity
+    needed for candidates if it is too small; the rows are then incomplete."""
     clusters = pairs.clusters
     scratch = _new_scratch(pairs, capacity)
     arity = lanes_of(pairs.tree.low)
@@ -100,12 +98,10 @@ def fill_block(pairs, block, capacity):
     return 0
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _find_families(pairs, first, end, scratch):
-    """Families of clusters that may be within reach of clusters first ... end - 1. Returns their number.
-
-    The number may exceed the capacity.
-    """
+    """Find families of clusters that may be within reach of clusters first ... end - 1. Returns their number, which may
+    exceed the capacity."""
     tree, into, low, high = pairs.tree, scratch.family, scratch.low, scratch.high
     radius = _reach(pairs)
     families = 0
@@ -122,9 +118,8 @@ def _find_families(pairs, first, end, scratch):
         if not reaches:
             continue
         count = len(pairs.clusters.origin) // 4
-        found = families_within_reach(
-            tree, low, high, radius * radius, first, end, count, scratch.stack, into, families
-        )
+        stack, radius2 = scratch.stack, radius * radius
+        found = families_within_reach(tree, low, high, radius2, first, end, count, stack, into, families)
         for n in range(families, min(found, len(into))):
             into[n] = IMAGES * into[n] + image
         families = found
@@ -133,17 +128,15 @@ def _find_families(pairs, first, end, scratch):
 
 @kernel(inline=True)
 def _reach(pairs):
-    """The distance within which a list has sites, Å, and what rounding may add."""
+    """The distance within which a list has sites, Å, with an allowance for rounding."""
     return (pairs.cutoff + pairs.skin) * (1 + ROUNDING)
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _find_candidates(pairs, c, scratch, families):
-    """Candidates for a cluster's rows: clusters and images whose box is within reach of its box. Returns their number.
-
-    The number may exceed the capacity. There is no branch for each candidate: the next one takes the place of one that is
-    none.
-    """
+    """Find candidates for the rows of a cluster: clusters and images whose box is within reach of its box. Returns
+    their number, which may exceed the capacity. There are no branches: a candidate out of reach is overwritten by the
+    next one."""
     tree, into, shift = pairs.tree, scratch.candidate, pairs.shift
     arity = lanes_of(tree.low)
     count = len(pairs.clusters.origin) // 4
@@ -163,7 +156,7 @@ def _find_candidates(pairs, c, scratch, families):
     return candidates
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def _fill_rows(pairs, block, c, scratch, candidates):
     """Fill the rows of a cluster from its candidates."""
     width = lanes_of(pairs.clusters.local)
@@ -192,7 +185,7 @@ def _fill_rows(pairs, block, c, scratch, candidates):
 
 @kernel(inline=True)
 def _store_neighbors(pairs, block, c, scratch, count):
-    """List what the rows of a cluster meet: the first of the candidates."""
+    """Store the neighbours of a cluster: the first of the candidates."""
     there, origin_vector, filled = pairs.neighbors[block], pairs.origin_vector[block], scratch.filled
     first = filled[NEIGHBORS]
     for n in range(count):
@@ -210,10 +203,8 @@ def _store_neighbors(pairs, block, c, scratch, count):
 
 @kernel(inline=True)
 def _sort_by_kind(pairs, c, scratch, count):
-    """Write the entries of each row of a cluster by their kinds; `place` then has the end of each kind.
-
-    The rows go together: an entry waits for the one before it in its row, and meanwhile the other rows have theirs.
-    """
+    """Write the entries of each row of a cluster by their kinds; `kind_end` then has the end of each kind. The rows are
+    done together: while an entry of one row waits for the entry before it, the other rows proceed."""
     rows = lanes_of(pairs.clusters.local) // 2
     kind_end, kind = scratch.kind_end, scratch.kind
     kind_end[:] = 0
@@ -231,10 +222,8 @@ def _sort_by_kind(pairs, c, scratch, count):
 
 @kernel(inline=True)
 def _begin_kinds(beyond, kind_end):
-    """Where the entries of each kind begin in a row, from their numbers, and how many are beyond each shell.
-
-    `beyond` is limited by its type: entries above that limit count as if they were inside the shell.
-    """
+    """Where the entries of each kind begin in a row, from their numbers; how many are beyond each shell. `beyond` is
+    limited by its type: entries above the limit are treated as if they were inside the shell."""
     inside = 0
     for k in range(SHELLS):
         inside += kind_end[k]
@@ -249,7 +238,7 @@ def _begin_kinds(beyond, kind_end):
 
 @kernel(inline=True)
 def _write_row(entries, found, count, filled):
-    """Append the first `count` found to the entries, if there is capacity."""
+    """Append the first `count` found to the entries, if the capacity suffices."""
     first = filled[ENTRIES]
     filled[ENTRIES] += count
     if filled[ENTRIES] <= len(entries):
@@ -259,10 +248,8 @@ def _write_row(entries, found, count, filled):
 
 @kernel(inline=True)
 def _find_kinds(pairs, c, scratch, candidates):
-    """Reduce the candidates to those that a row of the cluster has, and find their kinds; returns their number.
-
-    There are no unpredictable branches: the processor works on several candidates at a time.
-    """
+    """Reduce the candidates to those that a row of the cluster needs, and find their kinds; returns their number. There
+    are no unpredictable branches, so the processor works on several candidates at a time."""
     rows = lanes_of(pairs.clusters.local) // 2
     candidate, close = scratch.candidate, scratch.close
     last = len(pairs.clusters.origin) // 4 - 1  # the cluster that may have slots without a site
@@ -283,29 +270,25 @@ def _find_kinds(pairs, c, scratch, candidates):
 
 @kernel(inline=True)
 def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
-    """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask.
-
-    Returns whether a row has it, and whether some sites are as near as those of one group can be.
-
-    The sites of the cluster are the lanes, and the loop runs over the candidate's sites: there are no sums across
-    lanes.
-    """
+    """Write the kind of a candidate in each row of a cluster, from kind[at] on, as if no entry needed a mask. Returns
+    whether a row needs it, and whether some sites are as near as sites of one group can be. The sites of the cluster
+    are the lanes, and the loop runs over the sites of the candidate: there are no sums across lanes."""
     clusters = pairs.clusters
-    places = clusters.reference
-    width = lanes_of(places)
+    reference = clusters.reference
+    width = lanes_of(reference)
     other, image = cluster_of(candidate), image_number(candidate)
     begin = 3 * width * c
-    x = load(places, begin) + _origin_vector(pairs, c, other, image, 0)
-    y = load(places, begin + width) + _origin_vector(pairs, c, other, image, 1)
-    z = load(places, begin + 2 * width) + _origin_vector(pairs, c, other, image, 2)
+    x = load(reference, begin) + _origin_vector(pairs, c, other, image, 0)
+    y = load(reference, begin + width) + _origin_vector(pairs, c, other, image, 1)
+    z = load(reference, begin + 2 * width) + _origin_vector(pairs, c, other, image, 2)
     # |x - y|²/2 = |x|²/2 - x y + |y|²/2: three multiply-adds for each y. Their rounding error, bounded by |x|² + |y|²,
-    # is subtracted. Of two sums none waits for the other.
-    one, two = broadcast(inf, places), broadcast(inf, places)
+    # is subtracted. Two minima are independent of each other, which is faster.
+    one, two = broadcast(inf, reference), broadcast(inf, reference)
     for lane in range(0, width, 2):
         one = minimum(one, _half_square_less_product(clusters, other, lane, x, y, z))
         two = minimum(two, _half_square_less_product(clusters, other, lane + 1, x, y, z))
     nearest2 = 2.0 * minimum(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
-    kinds = broadcast(0.0, places)
+    kinds = broadcast(0.0, reference)
     if pairs.cutoff < inf:
         distance = square_root(maximum(pairwise_minimum(nearest2), 0.0))
         scale = pairs.shells_per_A
@@ -318,11 +301,11 @@ def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
 @kernel(inline=True)
 def _half_square_less_product(clusters, other, lane, x, y, z):
     """|y|²/2 - x y for one site y of another cluster."""
-    places = clusters.reference
-    width = lanes_of(places)
+    reference = clusters.reference
+    width = lanes_of(reference)
     at = 3 * width * other + lane
-    rest = load_broadcast(clusters.half_square, width * other + lane) - z * load_broadcast(places, at + 2 * width)
-    return rest - y * load_broadcast(places, at + width) - x * load_broadcast(places, at)
+    rest = load_broadcast(clusters.half_square, width * other + lane) - z * load_broadcast(reference, at + 2 * width)
+    return rest - y * load_broadcast(reference, at + width) - x * load_broadcast(reference, at)
 
 
 @kernel(inline=True)
@@ -334,31 +317,31 @@ def _mark_entries_to_mask(pairs, c, kind, candidate, at):
     all_lanes = (1 << width) - 1
     special = all_lanes
     if other != c and c != last and other != last:
-        group = load_converted(clusters.group, width * c, clusters.local)
+        group = load_with_lanes_of(clusters.group, width * c, clusters.local)
         mates = group < group
         for lane in range(width):
             mates = mates | (group == clusters.group[width * other + lane])
         special = mask_bits(mates)
     for row in range(width // 2):
-        kind[at + row] = NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]  # written anyway: no branch
+        kind[at + row] = NEEDS_MASK if special >> 2 * row & 3 else kind[at + row]  # always written: no branch
 
 
 @kernel(inline=True)
 def _mask_of_lanes(pairs, i, candidate, radius2):
-    """The sites of a candidate that interact with site i, as bits; 0 if none is inside the radius."""
+    """The sites of a candidate that interact with the site in slot i, as bits; 0 if none is inside the radius."""
     if i >= len(pairs.group):
         return 0
     clusters = pairs.clusters
-    places = clusters.reference
-    width = lanes_of(places)
+    reference = clusters.reference
+    width = lanes_of(reference)
     all_lanes = (1 << width) - 1
     c, other, image = i // width, cluster_of(candidate), image_number(candidate)
     at = 2 * width * c + i
     start = 3 * width * other
-    dx = places[at] + _origin_vector(pairs, c, other, image, 0) - load(places, start)
-    dy = places[at + width] + _origin_vector(pairs, c, other, image, 1) - load(places, start + width)
-    dz = places[at + 2 * width] + _origin_vector(pairs, c, other, image, 2) - load(places, start + 2 * width)
-    left_out = mask_bits(load_converted(clusters.group, width * other, places) == clusters.group[i])
+    dx = reference[at] + _origin_vector(pairs, c, other, image, 0) - load(reference, start)
+    dy = reference[at + width] + _origin_vector(pairs, c, other, image, 1) - load(reference, start + width)
+    dz = reference[at + 2 * width] + _origin_vector(pairs, c, other, image, 2) - load(reference, start + 2 * width)
+    left_out = mask_bits(load_with_lanes_of(clusters.group, width * other, reference) == clusters.group[i])
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:
@@ -367,9 +350,9 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def update_origin_vectors_of_block(pairs, block):
-    """Write the vectors between the origins of a block anew, where images have moved."""
+    """Recompute the vectors between origins of a block, for the images that have moved."""
     origin_vector = pairs.origin_vector[block]
     if len(origin_vector) == 0:
         return

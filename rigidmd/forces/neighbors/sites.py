@@ -1,6 +1,6 @@
-"""Sites of one potential: their positions for a state of the bodies, and the forces and torques on the bodies from theirs.
+"""Sites of one potential: their positions for a state of the bodies, and the forces and torques on the bodies.
 
-Each potential has its own list of sites: those that take part in it. Sites of one molecule are consecutive.
+Each potential has a list of the sites that take part in it. Sites of one molecule are consecutive.
 """
 
 from typing import NamedTuple
@@ -22,20 +22,20 @@ from rigidmd.compile import (
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import EXAMPLE
 
-# Up to this number, loops over molecules stay on one thread: they take a few microseconds.
+# Up to this number, loops over molecules run on one thread: they take a few microseconds.
 SERIAL_MOLECULES = 128
-MOLECULES_PER_BLOCK = 4096  # molecules of a block, where there are more blocks than the fewest
+MOLECULES_PER_BLOCK = 4096  # if there are more blocks than the minimum
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def blocks_of(molecules):
-    """Number of blocks in which molecules are moved: one, on this thread, where there are few."""
+    """Number of blocks in which molecules are moved: one, on this thread, for few molecules."""
     return max(BLOCKS, min(MOST_BLOCKS, molecules // MOLECULES_PER_BLOCK)) if molecules > SERIAL_MOLECULES else 1
 
 
 @kernel(inline=True)
 def molecules_of_block(molecules, block, together):
-    """The first molecule of a block, and the first that is no more in it: whole groups of so many, but for the last."""
+    """First and end of the molecules of a block: whole groups of `together` molecules, except the last."""
     blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
     return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
 
@@ -51,9 +51,9 @@ class BodySites(NamedTuple):
 
     first: np.ndarray  # (n + 1,) int32 molecule m has sites first[m] ... first[m + 1] - 1
     molecule: np.ndarray  # (s,) int32 molecule of each site
-    kind: np.ndarray  # (n,) int32 molecule m has offsets offset_body[kind[m]], offset_body[kind[m] + 1], ...
+    kind: np.ndarray  # (n,) int32 index in offset_body of the first site of each molecule
     offset_body: np.ndarray  # (rows, 3) from the centre of mass, body frame, Å; stored once for each species
-    inverse_inertia: np.ndarray  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 where the moment is 0
+    inverse_inertia: np.ndarray  # (rows, 3) of the molecule of each row, 1/(u Å²); 0 if the moment is 0
 
     def offsets(self) -> np.ndarray:
         """Offsets (s, 3) of all sites, body frame, Å."""
@@ -61,7 +61,7 @@ class BodySites(NamedTuple):
 
 
 class CentralSites(NamedTuple):
-    """Sites at their molecules' centres of mass: they have no offsets and exert no torque."""
+    """Sites at the centres of mass of their molecules: no offsets, no torque."""
 
     first: np.ndarray
     molecule: np.ndarray
@@ -72,28 +72,25 @@ class CentralSites(NamedTuple):
 
 
 def sites_of(species: np.ndarray, offsets: list[np.ndarray], inverse_inertia: np.ndarray) -> BodySites | CentralSites:
-    """The sites of molecules whose species (n,) are given, with offsets[k] (own, 3) in species k, body frame, Å.
-
-    inverse_inertia : (species, 3) as in `Model`
-    """
+    """The sites of molecules whose species (n,) are given, with offsets[k] (sites, 3) in species k, body frame, Å.
+    inverse_inertia : (species, 3) as in `Model`"""
     counts = np.array([len(of_species) for of_species in offsets])
     first = np.concatenate([[0], np.cumsum(counts[species])]).astype(np.int32)
     molecule = np.repeat(np.arange(len(species), dtype=np.int32), counts[species])
     if np.array_equal(molecule, first[:-1]):
-        molecule = first[:-1]  # a site of each: one array will do
+        molecule = first[:-1]  # one site each: one array for both
     offset = np.concatenate(offsets)
     if not offset.any():
         return CentralSites(first, molecule)
     kind = (np.cumsum(counts) - counts)[species].astype(np.int32)
     if np.array_equal(kind, species):
-        kind = species.astype(np.int32, copy=False)  # as of one species
+        kind = species.astype(np.int32, copy=False)  # the same array for both
     return BodySites(first, molecule, kind, np.ascontiguousarray(offset), np.repeat(inverse_inertia, counts, axis=0))
 
 
 def exclusion_groups(sites: BodySites | CentralSites, frozen: np.ndarray) -> np.ndarray:
-    """Group of each site (s,); sites of one group do not interact. A molecule is one; all frozen molecules are one.
-
-    frozen (n,) : whether each molecule is
+    """Exclusion group of each site (s,): the molecule, or one group for all frozen molecules. Sites of a group do not
+    interact. frozen (n,) : whether each molecule is frozen
     """
     if not frozen.any():
         return sites.molecule
@@ -115,7 +112,7 @@ class InSlots(NamedTuple):
 
 @kernel(inline=True)
 def index_of_x(slot, width):
-    """Where arrays of x, y, z in slots have the x of a slot; `width` is a power of two."""
+    """Index of the x of a slot in an array of x, y, z in slots; `width` is a power of two."""
     return 3 * slot - 2 * (slot & (width - 1))
 
 
@@ -160,7 +157,7 @@ def _locate_site(sites, state, m, i):
 
 
 def predict_site(sites, state, m, i, lead):
-    """Where site i of molecule m will be after a time `lead` if nothing acts and it keeps its angular velocity, Å."""
+    """Position of site i of molecule m after a time `lead` at constant velocity and angular velocity, Å."""
     raise TypeError("compiled code only")
 
 
@@ -179,7 +176,7 @@ def _predict_site(sites, state, m, i, lead):
         )  # fmt: skip
         row = sites.kind[m] - sites.first[m] + i
         offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
-        # Cayley's rotation: by 2 atan(|a|) about a = lead omega / 2; distances within a molecule stay what they are
+        # Cayley rotation by 2 atan(|a|) about a = lead omega / 2, which keeps distances within a molecule
         a, b, c = (
             0.5 * lead * inverse[0] * momentum[0],
             0.5 * lead * inverse[1] * momentum[1],
@@ -213,7 +210,7 @@ def turned(sites, state, m, i):
 
 
 def load_molecule(sites, state, load, m, site_force):
-    """Add the sum of molecule m's site forces, and their torque about the centre of mass, to its load."""
+    """Add the site forces of molecule m, and their torque about the centre of mass, to its load."""
     raise TypeError("compiled code only")
 
 
@@ -231,7 +228,7 @@ def _load_molecule(sites, state, load, m, site_force):
         return load_central
 
     def load_body(sites, state, load, m, site_force):
-        m = np.uint64(m)  # an index without a sign is not tested for being negative
+        m = np.uint64(m)  # an unsigned index is not tested for being negative
         q, force, torque = state.rotation[m], load.force[m], load.torque_body[m]
         begin = sites.kind[m] - sites.first[m]
         sum_x = sum_y = sum_z = turn_x = turn_y = turn_z = 0.0  # kept in registers until the last site
@@ -259,12 +256,12 @@ def _load_molecule(sites, state, load, m, site_force):
 
 @kernel(inline=True)
 def compute_molecule_positions(sites, state, m, site_position):
-    """Write the positions of molecule m's sites into site_position (s, 3), lab frame."""
+    """Write the positions of the sites of molecule m into site_position (s, 3), lab frame."""
     for i in range(sites.first[m], sites.first[m + 1]):
         site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def compute_site_positions(sites, state, site_position):
     """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
     for m in range(len(state.position)):
@@ -280,7 +277,7 @@ def load_from_sites(sites, state, load, site_force):
 
 @task()
 def compute_positions_of_block(arguments, block):
-    """`compute_site_positions` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    """`compute_site_positions` for the molecules of a block, see `blocks_of`."""
     sites, state, site_position = load_arguments(arguments)
     for m in _molecules_of(state, block):
         compute_molecule_positions(sites, state, m, site_position)
@@ -288,7 +285,7 @@ def compute_positions_of_block(arguments, block):
 
 @task()
 def load_block(arguments, block):
-    """`load_from_sites` for the molecules of a block, see `blocks_of`; a parcel of its arguments."""
+    """`load_from_sites` for the molecules of a block, see `blocks_of`."""
     sites, state, load, site_force = load_arguments(arguments)
     for m in _molecules_of(state, block):
         load_molecule(sites, state, load, m, site_force)
@@ -305,7 +302,7 @@ def add_offset_virial_of_block(arguments, block):
 
 
 def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray, virial: np.ndarray) -> dict:
-    """The tasks "positions", "load" and "offset_virial" for positions and forces (s, 3), see `Code`."""
+    """The tasks "positions", "load" and "offset_virial" of a `Code`, for positions and forces (s, 3)."""
     state, load = EXAMPLE
     return {
         "positions": (compute_positions_of_block, (sites, state, position)),
@@ -315,14 +312,14 @@ def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.
 
 
 def virial_buffer() -> np.ndarray:
-    """Room for the sums of `add_offset_virial_of_block`: 9 of each block, which has two lines of cache to itself."""
+    """Array for the sums of `add_offset_virial_of_block`: 9 for each block, which has two cache lines."""
     return np.zeros((MOST_BLOCKS, 16))
 
 
 def to_molecular_virial(sites, code, state, site_force, virial, tally):
     """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
 
-    code : has `add_offset_virial_of_block` as "offset_virial"; virial : of `virial_buffer`
+    code : with the task "offset_virial". virial : of `virial_buffer`
     """
     raise TypeError("compiled code only")
 
@@ -343,7 +340,7 @@ def _virial_of_molecules(sites, code, state, site_force, virial, tally):
 
 
 def _add_offset_virial(sites, state, m, site_force, virial):
-    """Add f (x) (x_site - X_molecule) of a molecule's sites to nine numbers."""
+    """Add f (x) (x_site - X_molecule) of the sites of a molecule to nine numbers."""
     raise TypeError("compiled code only")
 
 

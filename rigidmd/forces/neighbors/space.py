@@ -1,4 +1,4 @@
-"""The space molecules live in: a periodic box with right angles, a slanted one, or none."""
+"""The cell of a system: a periodic box with right angles, a triclinic one, or none."""
 
 from math import inf, prod
 from typing import NamedTuple
@@ -17,7 +17,7 @@ class Orthorhombic(NamedTuple):
 
     @property
     def edges(self) -> tuple[float, float, float]:
-        """Edges of the upright brick that repeats along the cell's vectors, Å."""
+        """Edges of the orthorhombic brick that repeats along the cell vectors, Å."""
         return tuple(self[:3])
 
     @property
@@ -27,11 +27,9 @@ class Orthorhombic(NamedTuple):
 
 
 class Triclinic(NamedTuple):
-    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are those of LAMMPS.
-
-    A brick with edges x, y, z repeats along a, b and c without gaps too, and so is as good a box: sites are brought
-    into that brick, where upright lists serve them.
-    """
+    """Periodic box of any shape: a = (x, 0, 0), b = (xy, y, 0), c = (xz, yz, z), Å; the names are those of LAMMPS. A
+    brick with edges x, y, z repeats along a, b and c without gaps too. Sites are shifted into that brick, where lists
+    for an orthorhombic box are used."""
 
     x: float
     y: float
@@ -45,7 +43,7 @@ class Triclinic(NamedTuple):
 
 
 class Unbounded(NamedTuple):
-    """No box: droplets and clusters in vacuum. The edges are infinite."""
+    """No box: droplets and clusters in vacuum, with infinite edges."""
 
     x: float = inf
     y: float = inf
@@ -75,7 +73,7 @@ def cell_of(space: Space) -> np.ndarray:
 
 
 def wrap(space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) moved by whole edges into the cell; as they are where there is none."""
+    """Positions (n, 3) shifted by whole edges into the cell; unchanged if there is no box."""
     if isinstance(space, Unbounded):
         return position
     return position - np.floor(fractions(space, position)) @ cell_of(space)
@@ -99,7 +97,7 @@ def volume_of(cell):
 
 @kernel
 def follow_cell(cell, known):
-    """Copy a cell (3, 3) into the one that is known; whether it has changed."""
+    """Copy a cell (3, 3) into `known`; whether that has changed."""
     changed = False
     for k in range(3):
         for n in range(3):

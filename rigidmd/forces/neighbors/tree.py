@@ -1,7 +1,7 @@
 """A tree of bounding boxes of clusters. It finds clusters within reach of one another in O(N log N) for any shape.
 
 A node has as many children as a vector of float64 has lanes, so one vector comparison tests all of them. The tree is
-searched once for some clusters near one another, down to families; each of the clusters then tests the boxes in these.
+searched once for some clusters near one another, down to families; each of the clusters then tests their boxes.
 """
 
 from math import ceil, inf
@@ -22,7 +22,7 @@ class BoxTree(NamedTuple):
 
 
 def empty_tree(count: int) -> BoxTree:
-    """Room for a tree of this many clusters."""
+    """A tree for `count` clusters, with empty boxes."""
     arity = lane_count(np.float64)
     level = [0]
     while len(level) == 1 or count > 1:
@@ -32,7 +32,7 @@ def empty_tree(count: int) -> BoxTree:
     return BoxTree(np.full(nodes, inf), np.full(nodes, -inf), np.array(level))
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def fit_boxes(tree, clusters):
     """Fit the boxes to newly sorted clusters."""
     arity = lanes_of(tree.low)
@@ -53,12 +53,12 @@ def fit_boxes(tree, clusters):
                 tree.high[k, node] = max(tree.high[k, node], tree.high[k, child])
 
 
-@kernel(inline=True, counted=False)
+@kernel(inline=True, count_references=False)
 def families_within_reach(tree, low, high, radius2, first, end, clusters, stack, found, count):
     """Write to found[count:], ascending, families that may have clusters closer than a radius to a box (3,), (3,).
 
-    Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a cluster at most half a
-    turn ahead, on the ring, of one of clusters first ... end - 1. Returns the new count, which may exceed the room;
+    Family f has clusters arity * f ... arity * (f + 1) - 1. Only those are taken that have a cluster at most half
+    way round the ring ahead of one of clusters first ... end - 1. Returns the new count, which may exceed len(found);
     stack (levels, 2) is scratch.
     """
     arity = lanes_of(tree.low)
@@ -101,10 +101,8 @@ def near(tree, node, low, high, radius2):
 
 @kernel(inline=True)
 def ahead(c, clusters, first, arity):
-    """Which of clusters first ... first + arity - 1 are at most half a turn ahead of cluster c on the ring, as bits.
-
-    Of two clusters opposite one another the second is ahead of the first.
-    """
+    """Which of clusters first ... first + arity - 1 are at most half way round the ring ahead of cluster c, as bits. Of
+    two clusters opposite one another the second is ahead of the first."""
     passed = _bits_below(c - first, arity)
     beyond = _bits_below(c + clusters // 2 + 1 - first, arity)
     around = _bits_below(c + (clusters - 1) // 2 + 1 - clusters - first, arity)
@@ -113,5 +111,5 @@ def ahead(c, clusters, first, arity):
 
 @kernel(inline=True)
 def _bits_below(k, count):
-    """Of so many bits those below bit k."""
+    """The lowest k of `count` bits."""
     return (1 << min(max(k, 0), count)) - 1

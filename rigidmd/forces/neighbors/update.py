@@ -1,4 +1,4 @@
-"""Keeping a neighbour list: its sites are moved with the bodies, and the list is rebuilt when it is no longer valid."""
+"""Update of a neighbour list: its sites move with the bodies, and it is rebuilt when it is not valid any longer."""
 
 from math import ceil, floor, inf, sqrt
 
@@ -36,35 +36,27 @@ from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
 
-#: A list is built for places that are ahead of the present ones by this share of the time that the last one served:
-#: its sites come nearer to them before they go away. It serves longer by a fifth (water) or a half (nitrogen). With a
-#: larger share the sites are farther from their places on average, and more shells of clusters have to be worked
-#: through.
+#: A list is built for positions predicted ahead by this fraction of the lifetime of the last list: sites first approach
+#: these. The list is valid for longer by a fifth (water) or a half (nitrogen). With a larger fraction the sites are
+#: farther from the predictions on average, and the loop has to work through more shells.
 LEAD_FRACTION = 0.25
-MAX_DISTANCE = (
-    1e9  # list radii from the origin; no radius is longer than a box, so 32 bits can count the boxes on the way
-)
+MAX_DISTANCE = 1e9  # in list radii from the origin, which are no longer than a box: 32 bits can count the boxes
 
 
 def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
-    """The machine code of the tasks that keep a list."""
+    """The machine code of the tasks that update a list."""
     site_arguments = (pairs, sites, EXAMPLE[0])
     return Code(
-        origin_vectors=(_update_origin_vectors, pairs),
-        local=(_set_local, site_arguments),
-        displacements=(_measure_displacements, pairs),
-        wrap=(_wrap_sites, site_arguments),
-        bin=(_bin_sites, site_arguments),
-        sort=(_sort_sites, pairs),
-        origins=(_set_origins, site_arguments),
-        boxes=(_fit_boxes, pairs),
-        fill=(_fill, pairs),
-    )
+        origin_vectors=(_update_origin_vectors, pairs), local=(_set_local, site_arguments),
+        displacements=(_measure_displacements, pairs), wrap=(_wrap_sites, site_arguments),
+        bin=(_bin_sites, site_arguments), sort=(_sort_sites, pairs), origins=(_set_origins, site_arguments),
+        boxes=(_fit_boxes, pairs), fill=(_fill, pairs),
+    )  # fmt: skip
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def update_list(pairs, code, sites, state):
-    """Move the clusters with the molecules, and rebuild the list if it is no longer valid; a status code."""
+    """Move the clusters with the molecules, and rebuild the list if it is not valid; a status code."""
     blocks = len(pairs.needed)
     arguments = pack_arguments(pairs)
     site_arguments = pack_arguments((pairs, sites, state))
@@ -87,7 +79,7 @@ def update_list(pairs, code, sites, state):
         return CELL_CHANGED
     now = state.time[NOW]
     lead = LEAD_FRACTION * (now - pairs.times[BUILT])
-    # the second time where some site is too far from its place ahead
+    # the second time only if a site is too far from its predicted position
     for ahead in (lead if abs(lead) < inf else 0.0), 0.0:
         pairs.times[LEAD_TIME] = ahead
         call_blocks(code, "wrap", site_arguments, blocks)
@@ -111,9 +103,9 @@ def update_list(pairs, code, sites, state):
     return status
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def refill(pairs, code):
-    """Build the list again from the clusters that `lists.restored` has put in; a status code."""
+    """Build the list again from the clusters that `lists.restored` has set; a status code."""
     restore_half_squares(pairs.clusters)
     _find_images(pairs)
     arguments = pack_arguments(pairs)
@@ -122,9 +114,9 @@ def refill(pairs, code):
     return _finish_build(pairs)
 
 
-@kernel(counted=False)
+@kernel(count_references=False)
 def _finish_build(pairs):
-    """Whether a list that has been filled is whole, into its counters; a status code."""
+    """Check that a list has not exceeded its capacities, and set its counters; a status code."""
     if (
         most_needed(pairs, ENTRIES) > pairs.entries.shape[1]
         or most_needed(pairs, MASKED) > pairs.masked.shape[1]
@@ -139,7 +131,7 @@ def _finish_build(pairs):
 
 @kernel
 def _has_no_nan(cell):
-    """Whether no component of a cell is NaN: comparisons and extremes would pass over it."""
+    """Whether no component of a cell is NaN, which comparisons and extremes do not detect."""
     for vector in range(3):
         for k in range(3):
             if cell[vector, k] != cell[vector, k]:
@@ -154,25 +146,23 @@ def _shortest(cell):
 
 @kernel
 def _cell_fits(pairs):
-    """Whether the cell has capacity for the cut-off and the skin."""
+    """Whether the cell is large enough for the cutoff and the skin."""
     shortest = _shortest(pairs.cell)
     return pairs.cutoff == inf or (2 * pairs.cutoff <= shortest and pairs.skin <= LONGEST_SKIN * shortest)
 
 
 @kernel
 def _max_slack(pairs):
-    """How far images may move until the list is built again, Å.
-
-    Images are sought so much farther than sites: one that was left out, and may move by twice as much as those that
-    were found, is out of reach meanwhile. No slack if such a search could find more images than there is capacity for.
-    """
+    """How far images may move until the list is built again, Å. Images are sought within a radius that is larger by
+    this: an image that was left out, and may move by twice as much as those that were found, stays out of reach. 0 if
+    such a search could find more images than the capacity."""
     is_short = pairs.cutoff < inf and 2.5 * pairs.skin <= _shortest(pairs.built)
     return 0.25 * pairs.skin if is_short else 0.0
 
 
 @kernel
 def _move_images(pairs):
-    """Move the images with the cell. Whether the list still serves; `update_origin_vectors_of_block` must then follow."""
+    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors_of_block` must follow."""
     farthest2 = 0.0
     for n in range(pairs.counters[IMAGES_FOUND]):
         moved2 = 0.0
@@ -187,7 +177,7 @@ def _move_images(pairs):
 
 @kernel(inline=True)
 def _displacement(cell, multiple, k):
-    """Component k of a sum of edges; an edge may be infinite where there is none of it."""
+    """Component k of a sum of edges; an edge that does not occur in it may be infinite."""
     total = 0.0
     for vector in range(3):
         if multiple[vector] != 0:
@@ -195,32 +185,32 @@ def _displacement(cell, multiple, k):
     return total
 
 
-@task(counted=False)
+@task(count_references=False)
 def _update_origin_vectors(arguments, block):
     pairs = load_arguments(arguments)
     update_origin_vectors_of_block(pairs, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _set_local(arguments, block):
     pairs, sites, state = load_arguments(arguments)
     set_local_of_block(pairs.clusters, pairs.cell, sites, state, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _measure_displacements(arguments, block):
     pairs = load_arguments(arguments)
     measure_displacements_of_block(pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0]), block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _wrap_sites(arguments, block):
     pairs, sites, state = load_arguments(arguments)
     lost = MAX_DISTANCE * (pairs.cutoff + pairs.skin)
     wrap_sites_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], lost, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _bin_sites(arguments, block):
     pairs, sites, _ = load_arguments(arguments)
     bin_sites_of_block(pairs.clusters, sites, block)
@@ -236,11 +226,9 @@ def _sort_sites(arguments, block):
 
 @kernel
 def _find_images(pairs):
-    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the first.
-
-    Bricks are stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27
-    images in an orthorhombic box and up to 48 in a triclinic one.
-    """
+    """Find the images of the brick (see `clusters`) near it in the present cell. Shift 0 is the first. Bricks are
+    stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27 images in an
+    orthorhombic box and up to 48 in a triclinic one."""
     cell, multiple = pairs.cell, pairs.multiple
     for vector in range(3):
         for k in range(3):
@@ -276,13 +264,13 @@ def _images_along(cell, k, offset, radius):
     return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
 
 
-@task(counted=False)
+@task(count_references=False)
 def _set_origins(arguments, block):
     pairs, sites, state = load_arguments(arguments)
     set_origins_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], pairs.group, block)
 
 
-@task(counted=False)
+@task(count_references=False)
 def _fit_boxes(arguments, block):
     pairs = load_arguments(arguments)
     fit_boxes(pairs.tree, pairs.clusters)

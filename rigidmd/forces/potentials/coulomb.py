@@ -1,4 +1,4 @@
-"""Charges: Coulomb's potential within a cut-off, with the reaction field of a continuum beyond it."""
+"""Coulomb potential with a reaction field: q_i q_j (1/r + field r²) within a cutoff, a dielectric beyond it."""
 
 from math import inf, sqrt
 from typing import NamedTuple
@@ -29,21 +29,19 @@ from rigidmd.units import COULOMB_CHARGE
 
 
 class ReactionField(NamedTuple):
-    """q_i q_j (1/r + field r²), with an ending at the cut-off.
-
-    field = (eps - 1)/((2 eps + 1) cutoff³) is the response of a continuum of permittivity eps beyond the cut-off to the
-    charges inside (Tironi et al. 1995, J. Chem. Phys. 102, 5451). Without a cut-off the field is 0: plain Coulomb.
-    """
+    """q_i q_j (1/r + field r²), truncated at the cutoff. field = (eps - 1)/((2 eps + 1) cutoff³) is the response of a
+    continuum of permittivity eps beyond the cutoff to the charges inside (Tironi et al. 1995, J. Chem. Phys. 102,
+    5451). Without a cutoff the field is 0: plain Coulomb."""
 
     cutoff: float  # Å
     truncation: Truncation
-    terms: TruncationTerms  # see endings.ending
+    terms: TruncationTerms  # see truncation.truncation_terms
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
     switched: SwitchTerm | SwitchCorrection | tuple[()] = NO_SWITCH
 
     def for_slots(self, slots: int, dtype: type) -> "ReactionField":
-        """The potential with room for the charges in slots, in the precision of lanes."""
+        """The potential with an array for the charges in slots, in the precision of the pair loop."""
         powers = {1: 1.0, 0: self.terms[0], -2: self.field}
         switched = switch_correction_of(self.truncation, powers, dtype) or switch_term_of(
             self.truncation, powers, dtype
@@ -54,7 +52,7 @@ class ReactionField(NamedTuple):
 def reaction_field(
     charge_e: np.ndarray, cutoff: float, permittivity: float = inf, name: TruncationName = "plain", start: float = 0.0
 ) -> ReactionField:
-    """The potential for sites with charges (s,) in e; the permittivity of the continuum is `inf` for a conductor."""
+    """The potential for sites with charges (s,) in e; a permittivity of `inf` means a conductor."""
     truncation = truncation_of(name, cutoff, start)
     strength = 0.5 if permittivity == inf else (permittivity - 1) / (2 * permittivity + 1)
     field = strength / cutoff**3
@@ -62,14 +60,14 @@ def reaction_field(
     def at(r: float) -> tuple[float, float, float]:
         return 1 / r + field * r**2, 1 / r**2 - 2 * field * r, -2 / r**3 - 2 * field
 
-    # A switching function multiplies the energy near the cut-off, which must be small there, so the energy is first
-    # shifted to zero at the cut-off. Unshifted, a pair of unit charges would lose 230 kJ/mol between 8 and 9 Å.
+    # A switching function multiplies the energy near the cutoff, which must be small there, so the energy is first
+    # shifted to zero at the cutoff. Unshifted, a pair of unit charges would lose 230 kJ/mol between 8 and 9 Å.
     terms = truncation_terms("shift" if name in SWITCHES else name, truncation, at)
     return ReactionField(cutoff, truncation, terms, field, charge_e * COULOMB_CHARGE)
 
 
 def powers(truncation, switched, r2):
-    """1/r, and two factors of 1/r³; where the force needs no 1/r they are found without it."""
+    """1/r, and two factors of 1/r³; found without 1/r if the force does not need it."""
     raise TypeError("compiled code only")
 
 
@@ -85,7 +83,7 @@ def _powers_of(truncation, switched, r2):
     return of_inverse
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def radial(potential, r2):
     """(energy, force/r) of two unit charges at squared distance r2, a number or a vector."""
     inverse, one, two = powers(potential.truncation, potential.switched, r2)
@@ -110,11 +108,9 @@ def _arrange(potential, slot_potential, order):
 
 
 def self_energy(potential: ReactionField, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of one molecule's charges in their own reaction field.
-
-    position (s, 3) of the molecule's charged sites, in the order of the first s of potential.charge. It is constant for a
-    rigid body, so it exerts no force; for a neutral molecule of dipole mu well inside the cut-off it is -field mu².
-    """
+    """Energy (u Å²/ps²) of the charges of one molecule in their reaction field. position (s, 3) of the charged sites of
+    the molecule, in the order of the first s of potential.charge. The energy is constant for a rigid body; for a
+    neutral molecule of dipole mu well inside the cutoff it is -field mu²."""
     charge = potential.charge[: len(position)]
     energy = 0.5 * charge @ charge * potential.terms[0]
     for i in range(len(position)):

@@ -1,8 +1,8 @@
-"""Potentials between pairs of sites from outside: a formula with parameters of its own, ended and mixed like Lennard-Jones.
+"""User pair potentials: a formula with its parameters, truncated and mixed like Lennard-Jones.
 
-A formula is a NamedTuple class, whose fields are the parameters of a pair of sites, and an `@implements(energy_and_force_at)`
-for it, which `formulas` writes. The parameters may be numbers or vectors: one formula serves a single kind of sites,
-whose parameters are numbers, and many kinds, whose parameters the loop loads from a table.
+A formula is a NamedTuple class, whose fields are the parameters of a pair of sites, with an
+`@implements(energy_and_force_at)`, which `formulas` writes. The parameters are numbers if all sites are of one kind, or
+vectors that the pair loop reads from a table.
 """
 
 from collections.abc import Callable
@@ -27,19 +27,19 @@ from rigidmd.forces.potentials.truncation import (
 
 
 class CustomPotential(NamedTuple):
-    """A formula between kinds of sites; its energy is 0 between kinds whose `interacts` is 0."""
+    """A formula between kinds of sites; the energy between kinds is 0 if their `interacts` is 0."""
 
     cutoff: float  # Å
     truncation: Truncation
-    formula: NamedTuple  # parameters of one kind with itself; of the formula's own class
-    shared: tuple  # what a formula needs besides, the same for all kinds
+    formula: NamedTuple  # parameters of one kind with itself
+    shared: tuple  # what a formula needs besides its parameters, the same for all kinds
     kind: np.ndarray  # (s,) kind of each site
     parameters: np.ndarray  # (parameters, kinds, kinds)
-    terms_of_kinds: np.ndarray  # (4, kinds, kinds) see endings.ending; all 0 between kinds that do not interact
+    terms_of_kinds: np.ndarray  # (4, kinds, kinds) see truncation.truncation_terms; 0 without interaction
     interacts: np.ndarray  # (kinds, kinds) 1 or 0
 
     def for_slots(self, slots: int, dtype: type) -> "CustomOneKind | CustomManyKinds":
-        """What the loop reads: numbers if all sites are of one kind, else tables with room for all slots."""
+        """What the pair loop reads: numbers if all sites are of one kind, else tables for all slots."""
         head, kinds = self[:4], self.parameters.shape[1]
         if kinds == 1:
             return CustomOneKind(*head, tuple(float(x) for x in self.terms_of_kinds[:, 0, 0]))
@@ -48,7 +48,7 @@ class CustomPotential(NamedTuple):
 
 
 class CustomOneKind(NamedTuple):
-    """The potential for sites of a single kind."""
+    """A user potential for sites of a single kind."""
 
     cutoff: float
     truncation: Truncation
@@ -58,29 +58,25 @@ class CustomOneKind(NamedTuple):
 
 
 class CustomManyKinds(NamedTuple):
-    """The potential with all numbers between each kind and the site in each slot, so that the loop needs no gathers."""
+    """A user potential with its numbers for each kind and the site in each slot, so that the loop needs no gathers."""
 
     cutoff: float
     truncation: Truncation
     formula: NamedTuple
     shared: tuple
     kind: np.ndarray  # (slots,)
-    table: (
-        np.ndarray
-    )  # (numbers kinds slots,): whether the pair acts, four numbers of its truncation_terms, its parameters
+    table: np.ndarray  # (numbers kinds slots,) of a pair: whether it interacts, 4 truncation terms, parameters
     stride: int  # kinds slots
 
 
 def energy_and_force_at(formula, shared, r2, inverse1, inverse2):
-    """(energy, force/r) of a formula at squared distances r2, with 1/r and 1/r²; u Å²/ps², scalars or vectors.
-
-    inverse1 is 0 where neither the formula nor its ending uses it.
-    """
+    """(energy, force/r) of a formula at squared distances r2, with 1/r and 1/r²; u Å²/ps², scalars or vectors. inverse1
+    is 0 if neither the formula nor the truncation uses it."""
     raise TypeError(f"{type(formula).__name__} is not a formula, or this was called outside compiled code")
 
 
 def uses_root(formula: Any, truncation: Any) -> bool:
-    """Whether a potential needs 1/r besides 1/r², by the Numba types of its formula and ending."""
+    """Whether a potential needs 1/r besides 1/r², by the Numba types of its formula and truncation."""
     return not is_a(truncation, Unmodified) or getattr(formula.instance_class, "uses_root", True)
 
 
@@ -90,8 +86,8 @@ def _pair(potential, i, j, r2):
         return lambda potential, i, j, r2: energy_and_force(potential, potential.formula, potential.terms, r2)
     if not is_a(potential, CustomManyKinds):
         return None
-    of_law = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
-    formula, truncation = of_law["formula"].instance_class, of_law["truncation"]
+    types = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
+    formula, truncation = types["formula"].instance_class, types["truncation"]
     names = [f"load(potential.table, at + {5 + p} * potential.stride)" for p in range(len(formula._fields))]
     terms = ["0.0"] * 4
     for k in range(1 if is_a(truncation, Unmodified) else 4 if is_a(truncation, ForceShifted) else 0):
@@ -102,8 +98,8 @@ def _pair(potential, i, j, r2):
             "    at = potential.kind[i] * len(potential.kind) + j",
             f"    formula = Formula({', '.join(names)})",
             f"    u, w = energy_and_force(potential, formula, ({', '.join(terms)}), r2)",
-            "    acts = load(potential.table, at) > 0.5",  # a formula may be no number where it does not act
-            "    return select(acts, u, 0.0), select(acts, w, 0.0)",
+            "    interacts = load(potential.table, at) > 0.5",  # a formula may be NaN without interaction
+            "    return select(interacts, u, 0.0), select(interacts, w, 0.0)",
         )
     )
     names_in = {"Formula": formula, "load": load, "select": select, "energy_and_force": energy_and_force}
@@ -112,7 +108,7 @@ def _pair(potential, i, j, r2):
 
 
 def energy_and_force(potential, formula, terms, r2):
-    """(energy, force/r) of a potential with the parameters and the ending of a pair."""
+    """(energy, force/r) of a potential with the parameters and the truncation terms of a pair."""
     raise TypeError("compiled code only")
 
 
@@ -159,13 +155,11 @@ def _arrange(potential, slot_potential, order):
 
 
 def tail_of_pair(radial: Callable[[float], tuple], terms: np.ndarray, truncation: Truncation) -> tuple[float, float]:
-    """What a cut-off takes from the energy, times the volume, and from the pressure, times its square; of one pair.
-
-    2 pi J with J = integral of r² (full - truncated), and 2 pi (J + R³ U/3) with the energy U at which it is cut off,
-    see `lennard_jones.tail`. Raises ArithmeticError where the energy falls too slowly.
-    """
+    """The tail correction of one pair: of the energy, times the volume, and of the pressure, times its square. 2 pi J
+    with J = integral of r² (full - truncated), and 2 pi (J + R³ U/3) with the energy U at the cutoff R, see
+    `lennard_jones.tail`. Raises ArithmeticError if the energy falls too slowly."""
     cutoff = truncation.cutoff
-    far = [abs(radial(share * cutoff)[0]) * share**3 for share in (1.0, 1e3)]
+    far = [abs(radial(factor * cutoff)[0]) * factor**3 for factor in (1.0, 1e3)]
     if far[1] > 0.1 * far[0]:
         raise ArithmeticError("its energy falls too slowly with the distance for tail_correction")
     start = getattr(truncation, "start", cutoff)
@@ -182,7 +176,7 @@ def tail_of_pair(radial: Callable[[float], tuple], terms: np.ndarray, truncation
 
 
 class Table(NamedTuple):
-    """An energy as cubic polynomials of r² between equally spaced values of it."""
+    """An energy as cubic polynomials of r² between equally spaced values of r²."""
 
     first: float  # the least r², Å²
     per_step: float  # 1/(step of r²), 1/Å²
@@ -190,7 +184,7 @@ class Table(NamedTuple):
 
 
 class Tabulated(NamedTuple):
-    """The formula of a table, which is what its kinds share."""
+    """The formula of a `Table`, which all kinds of sites have in common."""
 
     scale: float  # factor of the energy
 

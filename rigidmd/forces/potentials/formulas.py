@@ -1,8 +1,8 @@
-"""Formulas of potentials between pairs of sites: from the text of an energy, from a function, from a table.
+"""Formulas of user pair potentials: from the text of an energy, from a function, from a table.
 
 The force of a text is its derivative (SymPy). What does not depend on the distance is computed once for each pair of
-kinds, so that 4 eps ((sig/r)**12 - (sig/r)**6) costs what the built-in Lennard-Jones does. The code is written as a
-module that is named by its contents: compiled code for it is kept on disk (`core.own_code`).
+kinds, so that 4 eps ((sig/r)**12 - (sig/r)**6) is as fast as the built-in Lennard-Jones. The code is written as a
+module that is named by its contents, so that its compiled code is kept on disk (`core.user_modules`).
 """
 
 import ast
@@ -34,28 +34,26 @@ FUNCTIONS = {"exp": exp, "log": log, "sqrt": sqrt, "sin": sin, "cos": cos}
 OPERATORS = {ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.Pow: pow}
 DISTANCE = "r"
 MAX_TEXT_LENGTH, MAX_POWER, MAX_NODES, MAX_DEPTH = 2000, 200, 200, 20
-#: Decimal digits that numbers of a formula may have before or behind the point, powers of them multiplied out.
-MAX_DIGITS = 300
+MAX_DIGITS = 300  #: decimal digits of numbers in a formula, before or behind the point, with powers multiplied out
 #: Function of a distance (Å) that gives the energy v, -v' and -v'', in u Å²/ps².
 Radial = Callable[[float], tuple[float, float, float]]
-#: Values of r² in a table, equally spaced.
-STEPS = 4096
+STEPS = 4096  #: intervals of r² in a table, equally spaced
 
 
 class Formula(NamedTuple):
-    """A radial potential, energies in kJ/mol and distances in Å where users see them, u Å²/ps² in compiled code."""
+    """A radial potential: energies in kJ/mol and distances in Å for users, u Å²/ps² in compiled code."""
 
-    text: str  # what it is, for messages
+    text: str  # for messages
     parameters: tuple[str, ...]  # names of the parameters of a pair of sites
-    numbers: Callable[[Mapping[str, float]], tuple[float, ...]]  # what compiled code takes of them
+    numbers: Callable[[Mapping[str, float]], tuple[float, ...]]  # the fields of `kind` from the parameters
     radial: Callable[[Mapping[str, float]], Radial]  # of the parameters of a pair
-    kind: type  # the class that compiled code knows it by
+    kind: type  # the NamedTuple class of the formula in compiled code
     shared: tuple = ()
-    error: float = 0.0  # of the energy, relative to its largest value in reach; of a table
+    error: float = 0.0  # of the energy of a table, relative to its largest value in reach
 
 
 class FormulaError(ValueError):
-    """A formula that cannot be used: what is wrong with it."""
+    """A formula that cannot be used, and why."""
 
 
 # --- from a text -----------------------------------------------------------------------------------------------------
@@ -64,7 +62,7 @@ class FormulaError(ValueError):
 def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -> Formula:
     """The formula of an energy (kJ/mol) such as "A*exp(-B*r) - C/r**6", of r (Å) and named parameters.
 
-    constants : parameters that are the same for all sites, which then are numbers of the formula. Raises FormulaError.
+    constants : values of parameters that are the same for all sites. Raises FormulaError.
     """
     import sympy
 
@@ -85,7 +83,7 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
         raise
     except (ArithmeticError, ValueError, TypeError, RecursionError, MemoryError) as error:  # of SymPy and mpmath
         raise FormulaError(f"{energy!r} cannot be differentiated: {describe_error(error)}") from None
-    module = module_of(source.encode(), f"<potential {energy}>")
+    module = module_of(source.encode(), f"<pair potential {energy}>")
     names = {symbol.name[len(PARAMETER_PREFIX) :]: symbol for symbol in symbols}
 
     def numbers(given: Mapping[str, float]) -> tuple[float, ...]:
@@ -104,12 +102,12 @@ def formula_of_text(energy: str, constants: Mapping[str, float] | None = None) -
     return Formula(energy, tuple(names), numbers, radial, module.Formula)
 
 
-#: Before the names of a formula's formula_class parameters, which then differ from all others.
+#: Prefixes of the parameters of a formula and of what is computed from them, so that no name occurs twice.
 PARAMETER_PREFIX, CONSTANT_PREFIX = "own_", "whole_"
 
 
 def _derivative(e: "sympy.Expr", r: "sympy.Symbol", known: "dict[sympy.Expr, sympy.Expr]") -> "sympy.Expr":
-    """The derivative by r. SymPy's formula_class asks for signs of all that it makes, which takes 2**depth."""
+    """The derivative by r. SymPy's derivative determines the sign of every part, in a time like 2**depth."""
     import sympy
 
     if e not in known:
@@ -158,7 +156,7 @@ def _jet(e: "sympy.Expr", values: "Mapping[sympy.Symbol, float]", r: "sympy.Symb
                 "log": lambda: [log(a), 1 / a, -1 / a**2],
                 "sin": lambda: [sin(a), cos(a), -sin(a)],
                 "cos": lambda: [cos(a), -sin(a), -cos(a)],
-                "Abs": lambda: [abs(a), copysign(1.0, a), 0.0],  # SymPy makes it of (sig**2)**x
+                "Abs": lambda: [abs(a), copysign(1.0, a), 0.0],  # from (sig**2)**x
             }[e.func.__name__]()
         if any(isinstance(value, complex) for value in f):
             raise ValueError
@@ -169,7 +167,7 @@ def _jet(e: "sympy.Expr", values: "Mapping[sympy.Symbol, float]", r: "sympy.Symb
 
 
 def _terms(u: "sympy.Expr", r: "sympy.Symbol") -> "list[sympy.Expr]":
-    """The terms of a sum, into which factors without r are multiplied. Nothing else is expanded: it might not end."""
+    """The terms of a sum, multiplied by factors without r. Nothing else is expanded, which could take too long."""
     import sympy
 
     found = []
@@ -180,7 +178,7 @@ def _terms(u: "sympy.Expr", r: "sympy.Symbol") -> "list[sympy.Expr]":
 
 
 def _hoisted(u: "sympy.Expr", r: "sympy.Symbol") -> "tuple[dict[sympy.Symbol, sympy.Expr], sympy.Expr]":
-    """Symbols for what depends on the parameters alone, and the sum with them."""
+    """Symbols for factors that depend on the parameters only, and the sum with these symbols."""
     import sympy
 
     of: dict[sympy.Expr, sympy.Expr] = {}
@@ -197,7 +195,7 @@ def _hoisted(u: "sympy.Expr", r: "sympy.Symbol") -> "tuple[dict[sympy.Symbol, sy
 
 
 def _source(energy: str, total, force, fields: list, r) -> str:
-    """The module of a formula: total is its energy, force its force times r."""
+    """The source of the module of a formula with the energy `total` and the force times r, `force`."""
     import sympy
 
     powers: dict[int, sympy.Symbol] = {}
@@ -227,7 +225,7 @@ from math import cos, exp, log, pow, sin, sqrt
 from typing import NamedTuple
 
 from rigidmd.compile import implements, is_a
-from rigidmd.forces.potentials.custom import of_distance
+from rigidmd.forces.potentials.custom import energy_and_force_at
 
 
 class Formula(NamedTuple):
@@ -235,21 +233,21 @@ class Formula(NamedTuple):
     uses_root = {uses_root}
 
 
-@implements(of_distance, inline=True)
+@implements(energy_and_force_at, inline=True)
 def _of_distance(formula, shared, r2, inverse1, inverse2):
     if not is_a(formula, Formula):
         return None
 
-    def of_distance(formula, shared, r2, inverse1, inverse2):
+    def energy_and_force_at(formula, shared, r2, inverse1, inverse2):
 {body}
         return {_code(u)}, ({_code(w)}) * inverse2
 
-    return of_distance
+    return energy_and_force_at
 """
 
 
 def _powers_of(powers: Mapping[int, Any]) -> list[str]:
-    """Lines that compute whole powers of r, each from smaller ones."""
+    """Lines that compute integer powers of r, each from smaller ones."""
     lines: dict[str, str] = {}
 
     def even(n: int, square: str, stem: str) -> str:
@@ -303,11 +301,11 @@ def _code(e) -> str:
 
 
 def _parsed(energy: str, constants: Mapping[str, float]) -> "sympy.Expr":
-    """An energy as SymPy has it, read without running it: only arithmetic and `FUNCTIONS`. Raises FormulaError."""
+    """An energy as a SymPy expression, parsed without running it: arithmetic and `FUNCTIONS`. Raises FormulaError."""
     import sympy
 
     if len(energy) > MAX_TEXT_LENGTH:
-        raise FormulaError(f"it has {len(energy)} characters; {MAX_TEXT_LENGTH} are the most")
+        raise FormulaError(f"it has {len(energy)} characters, the limit is {MAX_TEXT_LENGTH}")
     try:
         tree = ast.parse(energy.strip(), mode="eval")
     except (SyntaxError, ValueError, MemoryError, RecursionError):
@@ -326,9 +324,9 @@ class _Part(NamedTuple):
     """A part of a formula."""
 
     value: "sympy.Expr"
-    number: float | None  # of a part that is a number
-    digits: float  # most decimal digits that a number in it may have, before or behind the point
-    power: float = 1.0  # largest product of whole exponents
+    number: float | None  # its value if it is a number
+    digits: float  # upper limit of the decimal digits of a number in it, before or behind the point
+    power: float = 1.0  # largest product of integer exponents
     has_log: bool = False  # exponentials of logarithms become powers
 
 
@@ -337,14 +335,14 @@ def _number(x: float, what: str) -> _Part:
     import sympy
 
     if isinstance(x, complex) or not isfinite(x) or (x and not abs(log10(abs(x))) <= MAX_DIGITS):
-        raise FormulaError(f"{what} is no real number between 1e-{MAX_DIGITS} and 1e{MAX_DIGITS}")
+        raise FormulaError(f"{what} is not a real number between 1e-{MAX_DIGITS} and 1e{MAX_DIGITS}")
     whole = 2 * x == int(2 * x) and abs(x) < 1e9  # and halves, for square roots
     return _Part(sympy.Rational(int(2 * x), 2) if whole else sympy.Float(x), x, abs(log10(abs(x))) if x else 0.0)
 
 
 def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
-    """A node of a formula as SymPy has it. Numbers are computed here: those of SymPy are exact, and may be too long for
-    any memory. Raises FormulaError."""
+    """A node of a formula as a SymPy expression. Raises FormulaError. Numbers are computed here, because those of SymPy
+    are exact, and may be too long for any memory."""
     import sympy
 
     def inner(of: ast.AST, more: int = 1) -> _Part:
@@ -390,8 +388,8 @@ def _read(node: ast.AST, constants: Mapping[str, float], depth: int) -> _Part:
     except (OverflowError, ValueError) as error:
         if isinstance(error, FormulaError):
             raise
-        raise FormulaError(f"{what} is no finite real number") from None
-    raise FormulaError(f"{what} has no place in a formula")
+        raise FormulaError(f"{what} is not a finite real number") from None
+    raise FormulaError(f"{what} is not allowed in a formula")
 
 
 def _combined(function: Callable, first: _Part, second: _Part, is_power: bool, what: str) -> _Part:
@@ -418,19 +416,19 @@ def _check(digits: float, power: float, what: str) -> None:
 # --- from a function -------------------------------------------------------------------------------------------------
 
 _COUNT = itertools.count()
-#: What a function of users may ask for besides the parameters.
+#: Arguments that a user function may have besides the parameters.
 ARGUMENTS = ("r", "r2", "inverse")
 
 
 def formula_of_function(function: Callable, kind: type | None = None) -> Formula:
-    """The formula of a function f(p, r) that gives (energy in kJ/mol, -dE/dr in kJ/mol/Å) for the parameters p.
+    """The formula of a function f(p, r) that returns (energy in kJ/mol, -dE/dr in kJ/mol/Å) for the parameters p.
 
-    It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of Python's `math`. By
-    their names it may also have the arguments r2 (r²) and inverse (1/r), which spare it a division.
+    It is compiled for vectors of distances: arithmetic, and exp, log, pow, sin, cos, sqrt, fabs of Python's `math`. It
+    may also have arguments named r2 (r²) and inverse (1/r), which save a division.
     kind : NamedTuple class of the parameters; default: the annotation of p. Raises FormulaError.
     """
     function = getattr(function, "py_func", function)
-    name = getattr(function, "__name__", "a potential")
+    name = getattr(function, "__name__", "a pair potential")
     if not inspect.isfunction(function):
         raise FormulaError(f"{function!r:.60} is not a function of Python, made by def or lambda")
     arguments = list(inspect.signature(function).parameters.values())
@@ -443,7 +441,7 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
     kind = kind or _annotated(function, arguments[0].name)
     if not (isinstance(kind, type) and issubclass(kind, tuple) and getattr(kind, "_fields", ())):
         raise FormulaError(
-            f"{name} does not say what its parameters are: annotate {arguments[0].name} with a NamedTuple"
+            f"the parameters of {name} are not known: annotate {arguments[0].name} with a NamedTuple class"
         )
     formula_class = _class_for(kind, function)
     given = [one.name for one in arguments[1:]]
@@ -453,7 +451,7 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
         try:
             found = function(formula_class(**values), *(asked[name] for name in given))
             energy, force = map(float, found)
-        except (Exception, SystemExit) as error:  # whatever a stranger's function raises
+        except (Exception, SystemExit) as error:  # a user function may raise anything
             raise FormulaError(
                 f"{name} at r = {distance:g} Å must give (energy, force), two numbers; {describe_error(error)}"
             ) from error
@@ -469,12 +467,9 @@ def formula_of_function(function: Callable, kind: type | None = None) -> Formula
         return value
 
     return Formula(
-        name,
-        formula_class._fields,
-        lambda values: tuple(values[field] for field in formula_class._fields),
-        radial,
+        name, formula_class._fields, lambda values: tuple(values[field] for field in formula_class._fields), radial,
         formula_class,
-    )
+    )  # fmt: skip
 
 
 def _annotated(function: Callable, argument: str) -> Any:
@@ -485,15 +480,15 @@ def _annotated(function: Callable, argument: str) -> Any:
 
 
 def _class_for(kind: type, function: Callable) -> type:
-    """A new class for a function, which compiled code tells it by: it sees the values that the function uses now."""
+    """A new class for a function, by which compiled code finds it: with the values that the function uses now."""
     module, name = function.__module__, f"{kind.__qualname__.rpartition('.')[2]}_of_{function.__name__}"
     formula_class = type(name, (kind,), {"__module__": module, "__qualname__": name, "uses_root": True})
-    formula_class.__name__ = f"{name}_{next(_COUNT)}"  # Numba's dispatchers take classes of one name for one type
+    formula_class.__name__ = f"{name}_{next(_COUNT)}"  # Numba takes classes of one name for one type
     compiled = compile_user_function(function, inline=True)
     asked = tuple(name for name in list(inspect.signature(function).parameters)[1:])
     values = {"r": "r2 * inverse1", "r2": "r2", "inverse": "inverse1"}
     source = (
-        "def of_distance(formula, shared, r2, inverse1, inverse2):\n"
+        "def energy_and_force_at(formula, shared, r2, inverse1, inverse2):\n"
         f"    energy, force = function(formula, {', '.join(values[name] for name in asked)})\n"
         f"    return {KJ_PER_MOL!r} * energy, ({KJ_PER_MOL!r} * inverse1) * force"
     )
@@ -502,7 +497,7 @@ def _class_for(kind: type, function: Callable) -> type:
 
     @implements(energy_and_force_at, inline=True)
     def _of_function(formula, shared, r2, inverse1, inverse2):
-        return names["of_distance"] if is_a(formula, formula_class) else None
+        return names["energy_and_force_at"] if is_a(formula, formula_class) else None
 
     return formula_class
 
@@ -511,11 +506,11 @@ def _class_for(kind: type, function: Callable) -> type:
 
 
 def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff: float) -> Formula:
-    """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cut-off.
+    """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cutoff.
 
-    A cubic spline through the values, taken again at equal steps of r², where the pair loop reads it; its force is the
-    derivative of what the loop reads. `error` is that of the spline, from a spline through every second value, divided
-    by 16 as befits its order, and that of reading it. Raises FormulaError.
+    The table is interpolated by a cubic spline, and tabulated again at equal steps of r² for the pair loop. The force
+    is the derivative of that table. `error` is the error of the spline, estimated by one through every second value
+    and divided by 16 for its order, plus the error of the second table. Raises FormulaError.
     """
     try:
         r, u = np.asarray(distance, float), np.asarray(energy, float)
@@ -528,7 +523,7 @@ def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff:
     if not (np.isfinite(r).all() and np.isfinite(u).all() and (np.diff(r) > 0).all() and r[0] > 0):
         raise FormulaError("a table needs ascending distances above 0, and finite energies")
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
-        raise FormulaError(f"the table ends at {r[-1]:g} Å, before the cut-off of {cutoff:g} Å")
+        raise FormulaError(f"the table ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å")
     spline = CubicSpline(r, u * KJ_PER_MOL)
     if not float(spline(r[0], 1)) < 0:
         raise FormulaError(f"the table begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances")
@@ -544,9 +539,8 @@ def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff:
     near = middle[spline(middle) < 10 * size]
     coarse = CubicSpline(r[::2], u[::2] * KJ_PER_MOL)
     near = near[near <= r[::2][-1]]
-    error = np.abs(coarse(near) - spline(near)).max(initial=0.0) / 16 + np.abs(read(near**2) - spline(near)).max(
-        initial=0.0
-    )
+    error = np.abs(coarse(near) - spline(near)).max(initial=0.0) / 16
+    error += np.abs(read(near**2) - spline(near)).max(initial=0.0)
 
     def radial(values: Mapping[str, float]) -> Radial:
         scale = values["scale"]

@@ -1,4 +1,4 @@
-"""Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with endings at the cut-off, mixing rules, tail correction."""
+"""Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with truncation, mixing rules and tail correction."""
 
 from math import pi
 from typing import Literal, NamedTuple
@@ -34,18 +34,18 @@ Mixing = Literal["lorentz-berthelot", "geometric"]
 
 
 class LennardJones(NamedTuple):
-    """c12/r¹² - c6/r⁶ between kinds of sites; each power has its own ending."""
+    """c12/r¹² - c6/r⁶ between kinds of sites; each power is truncated by itself."""
 
     cutoff: float  # Å
     truncation: Truncation
-    terms12: TruncationTerms  # see endings.ending
+    terms12: TruncationTerms  # see truncation.truncation_terms
     terms6: TruncationTerms
     kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
     c12: np.ndarray  # (kinds, kinds) u Å¹⁴/ps²
     c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
 
     def for_slots(self, slots: int, dtype: type) -> "LennardJonesOneKind | LennardJonesManyKinds":
-        """What the loop reads: numbers if all sites are of one kind, else a table with room for all slots."""
+        """What the pair loop reads: numbers if all sites are of one kind, else a table for all slots."""
         head, kinds = self[:4], len(self.c12)
         if kinds == 1:
             c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
@@ -61,12 +61,12 @@ class LennardJones(NamedTuple):
 def _switch_terms(
     truncation: Truncation, c12: float, c6: float, dtype: type
 ) -> tuple[SwitchTerm | tuple[()], SwitchTerm | tuple[()]]:
-    """What a switch adds to the forces of c12/r¹² and c6/r⁶."""
+    """The terms that a switch adds to the forces of c12/r¹² and c6/r⁶."""
     return switch_term_of(truncation, {12: c12}, dtype), switch_term_of(truncation, {6: c6}, dtype)
 
 
 class LennardJonesOneKind(NamedTuple):
-    """The potential for sites of a single kind."""
+    """Lennard-Jones for sites of a single kind."""
 
     cutoff: float
     truncation: Truncation
@@ -76,11 +76,11 @@ class LennardJonesOneKind(NamedTuple):
     c6: float
     addend12: SwitchTerm | tuple[()]  # of c12/r¹² and c6/r⁶
     addend6: SwitchTerm | tuple[()]
-    correction: SwitchCorrection | tuple[()]  # in their place
+    correction: SwitchCorrection | tuple[()]  # used instead of both
 
 
 class LennardJonesManyKinds(NamedTuple):
-    """The potential with coefficients between each kind and the site in each slot, so that the loop needs no gathers."""
+    """Lennard-Jones with coefficients for each kind and the site in each slot, so that the loop needs no gathers."""
 
     cutoff: float
     truncation: Truncation
@@ -103,10 +103,8 @@ def lennard_jones(
     mixing: Mixing = "lorentz-berthelot",
     special: dict[tuple[int, int], tuple[float, float]] | None = None,
 ) -> LennardJones:
-    """The potential for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps².
-
-    special : (kind, kind) -> (sigma, epsilon) instead of the mixing rule, for both orders of the kinds
-    """
+    """The potential for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps². special : (kind,
+    kind) -> (sigma, epsilon), instead of the mixing rule, for both orders of the kinds"""
     truncation = truncation_of(name, cutoff, start)
     sigma_ij = (sigma[:, None] + sigma) / 2 if mixing == "lorentz-berthelot" else np.sqrt(sigma[:, None] * sigma)
     epsilon_ij = np.sqrt(epsilon[:, None] * epsilon)
@@ -114,14 +112,10 @@ def lennard_jones(
         sigma_ij[[i, j], [j, i]] = pair_sigma
         epsilon_ij[[i, j], [j, i]] = pair_epsilon
     return LennardJones(
-        cutoff,
-        truncation,
-        truncation_terms(name, truncation, _inverse_power(12)),
-        truncation_terms(name, truncation, _inverse_power(6)),
-        kind,
-        4 * epsilon_ij * sigma_ij**12,
+        cutoff, truncation, truncation_terms(name, truncation, _inverse_power(12)),
+        truncation_terms(name, truncation, _inverse_power(6)), kind, 4 * epsilon_ij * sigma_ij**12,
         4 * epsilon_ij * sigma_ij**6,
-    )
+    )  # fmt: skip
 
 
 def _inverse_power(p: int):
@@ -185,7 +179,7 @@ def _energy_and_force(potential, c12, c6, r2):
 
 
 def inverses(truncation, switched, r2):
-    """(1/r², 1/r) at squared distances r2; where 1/r is not needed it is 0, to save the square root."""
+    """(1/r², 1/r) at squared distances r2; 1/r is 0 if it is not needed, to save the square root."""
     raise TypeError("compiled code only")
 
 
@@ -203,13 +197,11 @@ def _inverses(truncation, switched, r2):
 
 @kernel(inline=True)
 def mixed(terms12, terms6, c12, c6):
-    """The ending of the whole potential from those of its two powers."""
+    """The truncation terms of the potential from those of its two powers."""
     return (
-        c12 * terms12[0] - c6 * terms6[0],
-        c12 * terms12[1] - c6 * terms6[1],
-        c12 * terms12[2] - c6 * terms6[2],
-        c12 * terms12[3] - c6 * terms6[3],
-    )
+        c12 * terms12[0] - c6 * terms6[0], c12 * terms12[1] - c6 * terms6[1],
+        c12 * terms12[2] - c6 * terms6[2], c12 * terms12[3] - c6 * terms6[3],
+    )  # fmt: skip
 
 
 @implements(pairs.arrange)
@@ -230,7 +222,7 @@ def _arrange(potential, slot_potential, order):
 
 
 class Tail(NamedTuple):
-    """Energy and pressure lost by the cut-off, at any volume."""
+    """Tail correction: the energy and pressure beyond the cutoff, at any volume."""
 
     energy_volume: float  # energy times the volume, u Å⁵/ps²
     pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
@@ -245,25 +237,24 @@ class Tail(NamedTuple):
 
 
 def sum_of_tails(tails: list[Tail]) -> Tail | None:
-    """All of them together; None of none."""
+    """Sum of the tail corrections, or None if there are none."""
     return Tail(*np.sum(tails, axis=0).tolist()) if tails else None
 
 
 def tail(potential: LennardJones) -> Tail:
-    """Energy and pressure lost by the cut-off, for g(r) = 1 where the ending changes the potential.
+    """The tail correction, for g(r) = 1 where the truncation changes the potential.
 
-    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated). For endings that shift the whole
-    potential the constant inside counts too, as in GROMACS' dispersion correction (Allen & Tildesley 2017, 2.8). All N²
-    pairs are counted, also those of a molecule with itself: a relative error of 1/(number of molecules).
+    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated). If the truncation shifts the whole
+    potential, the constant inside counts too, as in GROMACS' dispersion correction (Allen & Tildesley 2017, 2.8). All
+    N² pairs are counted, with those of a molecule with itself: a relative error of 1/(number of molecules).
     """
     count = np.bincount(potential.kind, minlength=len(potential.c6))
     energy = pressure = 0.0
     for sign, c, p, terms in ((1, potential.c12, 12, potential.terms12), (-1, potential.c6, 6, potential.terms6)):
         lost = _lost(potential, terms, p)
-        # The pressure follows from the force alone: a jump of the energy at the cut-off (plain) does not contribute.
-        jump = (
-            potential.cutoff ** (3 - p) / 3 if terms[0] == 0 and isinstance(potential.truncation, Unmodified) else 0.0
-        )
+        # The pressure follows from the force alone: a jump of the energy at the cutoff (plain) does not contribute.
+        jumps = terms[0] == 0 and isinstance(potential.truncation, Unmodified)
+        jump = potential.cutoff ** (3 - p) / 3 if jumps else 0.0
         strength = sign * count @ c @ count
         energy += 2 * pi * strength * lost
         pressure += 2 * pi * strength * (lost + jump)

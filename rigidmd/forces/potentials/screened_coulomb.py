@@ -1,13 +1,13 @@
-"""Screened charges, with a Coulomb potential erfc(alpha r)/r: the real-space part of Ewald sums, and damped shifted forces.
+"""Screened Coulomb potential q_i q_j erfc(alpha r)/r: the real-space part of Ewald sums, and damped shifted forces.
 
 The pair loop computes neither erfc nor exp. The screening part erf(alpha r)/r is a smooth function of r², and so is its
-force over r. Each is a polynomial in r², fitted when the potential is created, with as many terms as the cut-off, alpha and
-the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per term.
+force over r. Each is a polynomial in r², fitted when the potential is created, with as many terms as the cutoff, alpha
+and the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per
+term.
 
-In vectors of 16 float32 the force is rather a cubic for each of 32 intervals of r²: a lookup takes one instruction,
-which runs beside the multiply-adds. For PME with a cut-off of 9 Å the loop takes 4 to 10 % less time than with the ten
-terms that it would need there, and the force is 30 times as accurate; without any screening it would take 14 to 20 %
-less.
+In vectors of 16 float32 the force is a cubic in each of 32 intervals of r²: a lookup takes one instruction, which runs
+in parallel with the multiply-adds. For PME with a cutoff of 9 Å the loop takes 4 to 10 % less time than with the ten
+terms that it would need, and the force is 30 times as accurate; without any screening it would take 14 to 20 % less.
 """
 
 from math import exp, pi, sqrt
@@ -30,20 +30,20 @@ from rigidmd.compile.simd import (
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.units import COULOMB_CHARGE
 
-#: Largest error of a polynomial, relative to the function at r = 0, by the precision of the lanes: smaller than the
-#: rounding error of its evaluation, 5e-15 and 1.5e-7 for alpha times the cut-off up to 4.
+#: Largest error of a polynomial, relative to the function at r = 0, by precision: below the rounding error of its
+#: evaluation, 5e-15 and 1.5e-7 for alpha times the cutoff up to 4.
 FIT_ERROR = {np.dtype(np.float64): 1e-15, np.dtype(np.float32): 3e-8}
-#: Numbers of terms of the energy and of the force are multiples of these: each number is another type of compiled code.
-#: The force, which most calls compute, has the finer step, so that it has at most three terms more than it needs.
+#: Numbers of terms of the energy and of the force are multiples of these, because each number compiles other code. The
+#: force, which most calls compute, has the finer step: at most three terms more than it needs.
 ENERGY_STEP, FORCE_STEP = 8, 4
 #: Intervals of a table, and coefficients of each.
 INTERVALS, TERMS = 32, 4
-#: Largest error of a table, relative as FIT_ERROR: the rounding error of the polynomial that it replaces.
+#: Largest error of a table, relative like FIT_ERROR: the rounding error of the polynomial that it replaces.
 TABLE_ERROR = 1.5e-7
 
 
 class Screening(NamedTuple):
-    """erf(alpha r)/r and its force over r, as polynomials in t = scale r² - 1, from -1 to 1 inside the cut-off."""
+    """erf(alpha r)/r and its force over r, as polynomials in t = scale r² - 1, from -1 to 1 inside the cutoff."""
 
     scale: float  # 2/cutoff², 1/Å²
     energy: tuple[float, ...]  # coefficients of erf(alpha r)/r, 1/Å
@@ -51,39 +51,31 @@ class Screening(NamedTuple):
 
 
 def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: float = 0.0) -> Screening:
-    """The polynomials for screening by alpha (1/Å) up to a cut-off (Å), for lanes of a NumPy dtype.
-
-    Each series is truncated where the rest is below FIT_ERROR of the value at r = 0, or where the error of the force
-    between unit charges is below `error` (1/Å²). Numbers of terms are multiples of ENERGY_STEP and FORCE_STEP, so that
-    small changes of alpha use the same compiled code.
-    """
+    """The polynomials for screening by alpha (1/Å) up to a cutoff (Å), for lanes of a NumPy dtype. Each series is
+    truncated where the rest is below FIT_ERROR of the value at r = 0, or where the error of the force between unit
+    charges is below `error` (1/Å²)."""
     kind = np.dtype(dtype)
     strength = 2 / sqrt(pi) * alpha
     energy = _cut(_series(alpha * cutoff, 0), 0.0, kind, ENERGY_STEP)
     of_unit = strength * 2 * alpha**2 * cutoff  # 0 without screening
     force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind, FORCE_STEP)
-    return Screening(
-        kind.type(2 / cutoff**2),
-        tuple(map(kind.type, strength * energy)),
-        tuple(map(kind.type, strength * 2 * alpha**2 * force)),
-    )
+    energy, force = strength * energy, strength * 2 * alpha**2 * force
+    return Screening(kind.type(2 / cutoff**2), tuple(map(kind.type, energy)), tuple(map(kind.type, force)))
 
 
 class TabledScreening(NamedTuple):
-    """The same, but the force over r is a cubic in x = s - k from s = k to k + 1, with s = density r²."""
+    """`Screening` with the force over r as a cubic in x = s - k from s = k to k + 1, with s = density r²."""
 
-    scale: float  # as that of Screening
+    scale: float  # as in Screening
     energy: tuple[float, ...]
     density: float  # intervals per Å²
     table: np.ndarray  # (TERMS INTERVALS,) float32, 1/Å³: coefficients of x^0 for all intervals, then of x^1, ...
 
 
 def screening_of_lanes(alpha: float, cutoff: float, dtype: type, error: float = 0.0) -> Screening | TabledScreening:
-    """What serves lanes of a NumPy dtype best: a table, where this machine has them and it is accurate enough.
-
-    A table has an error that grows with alpha times the cut-off, and is used up to about 3.2, or more if `error` (see
-    `screening`) allows it.
-    """
+    """The faster form for lanes of a NumPy dtype: a table, if this machine supports it and it is accurate enough. The
+    error of a table grows with alpha times the cutoff. It is used up to about 3.2, or more if `error` (see `screening`)
+    allows it."""
     found = screening(alpha, cutoff, dtype, error)
     if not HAS_AVX512 or dtype != np.float32:
         return found
@@ -97,18 +89,16 @@ def screening_of_lanes(alpha: float, cutoff: float, dtype: type, error: float = 
 
 
 def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, float]:
-    """Density, coefficients (TERMS, INTERVALS) in single precision, and largest error of the force, 1/Å².
-
-    Each cubic meets the function at four Chebyshev nodes of its interval. Neighbours differ at the knot between them by
-    up to twice the error.
-    """
-    # The last interval ends a little beyond the cut-off: a pair that rounding puts there must not get the first cubic.
+    """Density, coefficients (TERMS, INTERVALS) in single precision, and largest error of the force, 1/Å². Each cubic
+    meets the function at four Chebyshev nodes of its interval. Neighbours differ at the knot between them by up to
+    twice the error."""
+    # The last interval ends a little beyond the cutoff: a pair that rounding puts there must not get the first cubic.
     density = np.float32(INTERVALS / cutoff**2 * (1 - 8 * np.finfo(np.float32).eps))
     node, weight = np.polynomial.legendre.leggauss(64 + int(8 * alpha * cutoff))
     s, weight = 0.5 * (1 + node), 0.5 * weight
 
     def exact(x):
-        """Force over r, (..., INTERVALS), at places x within all intervals."""
+        """Force over r, (..., INTERVALS), at x within all intervals."""
         r2 = np.add.outer(x, np.arange(INTERVALS)) / float(density)
         return 4 * alpha**3 / sqrt(pi) * (np.exp(-np.multiply.outer(r2, (alpha * s) ** 2)) @ (weight * s**2)), r2
 
@@ -143,11 +133,9 @@ def _series(x: float, power: int) -> np.ndarray:
 
 
 class ScreenedCoulomb(NamedTuple):
-    """q_i q_j [erfc(alpha r)/r - shift], truncated at the cut-off R: the pair part of an Ewald sum.
-
-    With shift = erfc(alpha R)/R the energy is the one that the forces conserve. Without a shift the energy jumps
-    whenever a pair crosses the cut-off, which is most of its noise at small steps. The forces are the same.
-    """
+    """q_i q_j [erfc(alpha r)/r - shift], truncated at the cutoff R: the pair part of an Ewald sum. With shift =
+    erfc(alpha R)/R the energy is the one that the forces conserve. Without a shift the energy jumps when a pair crosses
+    the cutoff, which is most of its noise at small steps. The forces are the same."""
 
     cutoff: float  # Å
     alpha: float  # 1/Å
@@ -157,7 +145,7 @@ class ScreenedCoulomb(NamedTuple):
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
     def for_slots(self, slots: int, dtype: type) -> "ScreenedCoulomb":
-        """The potential with room for the charges in slots, in the precision of lanes."""
+        """The potential with an array for the charges in slots, in the precision of the pair loop."""
         error = self.error if dtype == np.float32 else 0.0
         fitted = screening_of_lanes(self.alpha, self.cutoff, dtype, error)
         return self._replace(charge=zeros(slots, dtype), screening=fitted)
@@ -168,20 +156,17 @@ def screened_coulomb(
 ) -> ScreenedCoulomb:
     """The potential for sites with charges (s,) in e.
 
-    shifted : whether the energy is 0 at the cut-off
-    error : allowed for forces between unit charges in single precision, 1/Å²; more terms of the polynomials would only
-        take time
+    shifted : whether the energy is 0 at the cutoff
+    error : allowed for forces between unit charges in single precision, 1/Å²
     """
     shift = float(erfc(alpha * cutoff)) / cutoff if shifted else 0.0
     return ScreenedCoulomb(cutoff, alpha, shift, error, screening(alpha, cutoff), charge_e * COULOMB_CHARGE)
 
 
 class DampedShiftedForce(NamedTuple):
-    """q_i q_j [erfc(alpha r)/r - erfc(alpha R)/R + slope (r - R)]: energy and force are 0 at the cut-off R.
-
-    slope = erfc(alpha R)/R² + 2 alpha exp(-alpha² R²)/(sqrt(pi) R) (Fennell & Gezelter 2006, J. Chem. Phys. 124,
-    234104, eq. 18); the same as coul/dsf of LAMMPS.
-    """
+    """q_i q_j [erfc(alpha r)/r - erfc(alpha R)/R + slope (r - R)]: energy and force are 0 at the cutoff R. slope =
+    erfc(alpha R)/R² + 2 alpha exp(-alpha² R²)/(sqrt(pi) R) (Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq.
+    18); the same as coul/dsf of LAMMPS."""
 
     cutoff: float  # Å
     alpha: float  # 1/Å
@@ -191,7 +176,7 @@ class DampedShiftedForce(NamedTuple):
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
     def for_slots(self, slots: int, dtype: type) -> "DampedShiftedForce":
-        """The potential with room for the charges in slots, in the precision of lanes."""
+        """The potential with an array for the charges in slots, in the precision of the pair loop."""
         fitted = screening_of_lanes(self.alpha, self.cutoff, dtype)
         return self._replace(charge=zeros(slots, dtype), screening=fitted)
 
@@ -205,10 +190,8 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
 
 
 def screened(screening, inverse, cube, r2):
-    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, two factors of 1/r³, and r².
-
-    Scalars only without a table. Valid up to the cut-off.
-    """
+    """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, two factors of 1/r³, and r². For scalars
+    `screening` must not be a table. Valid up to the cutoff."""
     raise TypeError("compiled code only")
 
 
@@ -274,21 +257,18 @@ def _arrange(potential, slot_potential, order):
 
 
 def damped_self_energy(potential: DampedShiftedForce, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of one molecule's charges with the neutralising images of damped shifted force.
+    """Energy (u Å²/ps²) of the charges of one molecule with the neutralising images of damped shifted force.
 
-    position (s, 3) of the molecule's charged sites, in the order of the first s of potential.charge. Each charge interacts
-    with its own image (Fennell & Gezelter 2006) and with those of its molecule, for which the pair loop has no pairs.
-    The energy is constant for a rigid body.
+    position (s, 3) of the charged sites of the molecule, in the order of the first s of potential.charge. Each charge
+    interacts with its image (Fennell & Gezelter 2006) and with the images of its molecule, for which the pair loop has
+    no pairs. The energy is constant for a rigid body.
     """
     charge = potential.charge[: len(position)]
     energy = (0.5 * potential.shift - potential.alpha / sqrt(pi)) * charge @ charge
     for i in range(len(position)):
         for j in range(i):
             r = float(np.linalg.norm(position[i] - position[j]))
-            u = (
-                float(erfc(potential.alpha * r)) / r + potential.slope * r + potential.shift
-                if r < potential.cutoff
-                else 0.0
-            )
+            inside = r < potential.cutoff
+            u = float(erfc(potential.alpha * r)) / r + potential.slope * r + potential.shift if inside else 0.0
             energy += charge[i] * charge[j] * (u - 1 / r)
     return float(energy)

@@ -1,12 +1,12 @@
-"""Truncation of a radial potential at its cut-off: plain, shift, force_shift, force_switch, switch or smooth_switch.
+"""Truncation of a pair potential at its cutoff: plain, shift, force_shift, force_switch, switch or smooth_switch.
 
-A potential is a sum of radial parts v(r). Inside the cut-off, v(r) becomes
+A pair potential is a sum of radial parts v(r). Inside the cutoff, v(r) becomes
 
     v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
 
-so p is added to the force -v'; or, for `switch` and `smooth_switch`, v(r) S(r) with S falling from 1 to 0.
+so p is added to the force -v'. With `switch` and `smooth_switch` it becomes v(r) S(r) with S falling from 1 to 0.
 
-| name | what it does | continuous at the cut-off |
+| name | what it does | continuous at the cutoff |
 |---|---|---|
 | plain | nothing | nothing |
 | shift | adds a constant (GROMACS potential-shift) | energy |
@@ -36,7 +36,7 @@ TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
 
 
 class Unmodified(NamedTuple):
-    """No change of the force inside the cut-off; `plain` and `shift`."""
+    """The force inside the cutoff is not changed; `plain` and `shift`."""
 
     cutoff: float  # Å, may be infinite
 
@@ -49,7 +49,7 @@ class ForceShifted(NamedTuple):
 
 
 class Switched(NamedTuple):
-    """The energy is multiplied by a polynomial of degree 5, from 1 at the start to 0 at the cut-off; `switch`."""
+    """The energy is multiplied by a polynomial of degree 5, from 1 at the start to 0 at the cutoff; `switch`."""
 
     cutoff: float  # Å
     start: float  # Å
@@ -68,7 +68,7 @@ SWITCHES = {"switch": Switched, "smooth_switch": SmoothlySwitched}
 
 
 def truncation_of(name: TruncationName, cutoff: float, start: float) -> Truncation:
-    """The truncation of the ending `name`; `start` (Å) matters for force_switch, switch and smooth_switch only."""
+    """The truncation with this name; `start` (Å) matters for force_switch, switch and smooth_switch only."""
     if cutoff == inf or name in ("plain", "shift"):
         return Unmodified(cutoff)
     if name in SWITCHES:
@@ -99,33 +99,30 @@ SWITCH_SERIES = {Switched: (2, (-10, 15, -6)), SmoothlySwitched: (4, (-126, 420,
 
 
 class SwitchTerm(NamedTuple):
-    """t^k (b0 + b1 t + b2 t² + ...): what a switch adds to p in the force/r p/r^(p+2) of 1/r^p."""
+    """t^k (b0 + b1 t + b2 t² + ...), which a switch adds to p in p/r^(p+2), the force/r of 1/r^p."""
 
     coefficients: tuple[float, ...]
 
 
 class SwitchCorrection(NamedTuple):
-    """(x + 1)² (b0 + b1 x + b2 x² + ...): what `switch` adds to force/r. It needs no root.
-
-    x goes from -1 at the start to 1 at the cut-off, evenly in r². In powers of x + 1 the terms would be thousands of
-    times their sum.
-    """
+    """(x + 1)² (b0 + b1 x + b2 x² + ...), which `switch` adds to force/r; it needs no square root. x is linear in r²,
+    from -1 at the start to 1 at the cutoff. In powers of x + 1 the terms would be thousands of times their sum."""
 
     coefficients: tuple[float, ...]
 
 
-#: Of endings that are no switch.
+#: Instead of a `SwitchTerm` or `SwitchCorrection`, for other truncations.
 NO_SWITCH = ()
-#: The error of a `SwitchCorrection`, relative to its largest value, and the most coefficients that it may have.
+#: The error of a `SwitchCorrection`, relative to its largest value, and its largest number of coefficients.
 CORRECTION_ERROR, MAX_COEFFICIENTS = 2e-7, 18
 
 
 def switch_term_of(truncation: Truncation, powers: dict[int, float], dtype: type) -> SwitchTerm | tuple[()]:
-    """The addend of a power c/r^p, given as {p: c}, or of a sum of powers, to the coefficient of the highest of them.
+    """The switch term of a power c/r^p, given as {p: c}, or of a sum of powers, for the coefficient of the highest.
 
-    It is exact: of r^-p, force/r becomes r^-(p+2) (p S - r S'), and S is a polynomial in t, as r is. Fractions keep all
-    digits where powers cancel, as those of a reaction field do. None of `smooth_switch` in single precision: its terms
-    are up to 1e4 times their sum.
+    It is exact: force/r of r^-p becomes r^-(p+2) (p S - r S'), and S is a polynomial in t, as r is. Fractions keep all
+    digits where powers cancel, as in a reaction field. There is none for `smooth_switch` in single precision, where its
+    terms are up to 1e4 times their sum.
     """
     if type(truncation) not in SWITCH_SERIES or (isinstance(truncation, SmoothlySwitched) and dtype == np.float32):
         return NO_SWITCH
@@ -140,11 +137,9 @@ def switch_term_of(truncation: Truncation, powers: dict[int, float], dtype: type
 
 
 def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype: type) -> SwitchCorrection | tuple[()]:
-    """The correction of a sum of powers, given as for `switch_term_of`, in single precision.
-
-    None in double precision, where it would have too many coefficients; nor of a switch that is too wide; nor of
-    `smooth_switch`, whose terms would be a thousand times their sum.
-    """
+    """The switch correction of a sum of powers, given as for `switch_term_of`, in single precision. There is none in
+    double precision, where it would have too many coefficients, for a switch that is too wide, and for `smooth_switch`,
+    whose terms would be a thousand times their sum."""
     if not isinstance(truncation, Switched) or dtype != np.float32 or truncation.start == 0:
         return NO_SWITCH
     of_highest = Polynomials(switch_term_of(truncation, powers, np.float64).coefficients)
@@ -156,7 +151,7 @@ def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype
         return per_x**2 * of_highest(per_x * (x + 1)) * r ** -(max(powers) + 2.0)
 
     x = np.linspace(-1, 1, 200)
-    with np.errstate(all="ignore"):  # a switch from almost 0 on is too wide
+    with np.errstate(all="ignore"):  # a switch that starts near 0 is too wide
         found = chebyshev.chebinterpolate(over_square, 2 * MAX_COEFFICIENTS)
         largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
@@ -167,7 +162,7 @@ def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype
 
 
 def switch_term(truncation, switched, r):
-    """An `SwitchTerm` at distances r; 0 below the start, and of anything else."""
+    """An `SwitchTerm` at distances r; 0 below the start, and for anything else."""
     raise TypeError("compiled code only")
 
 
@@ -185,7 +180,7 @@ def _switch_term(truncation, switched, r):
 
 
 def correction(truncation, switched, r2):
-    """A `SwitchCorrection` at squared distances r2; 0 below the start, and of anything else."""
+    """A `SwitchCorrection` at squared distances r2; 0 below the start, and for anything else."""
     raise TypeError("compiled code only")
 
 
@@ -202,35 +197,33 @@ def _correction(truncation, switched, r2):
     return correction
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def squared(x):
     """x²"""
     return x * x
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def to_the_fourth(x):
     """x⁴"""
     return x * x * (x * x)
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def switch_coordinate(truncation, r):
-    """t of a switch: 0 up to the start, 1 at the cut-off."""
+    """t of a switch: 0 up to the start, 1 at the cutoff."""
     return maximum((r - truncation.start) * (1 / (truncation.cutoff - truncation.start)), 0.0)
 
 
 def truncated(truncation, terms, switched, r2, inverse, u, w):
-    """(energy, force/r) with the truncation_terms, from u, w without it at squared distances r2; scalars or vectors.
-
-    u already includes the constant of `terms`. inverse : 1/r, where `needs_root` says so. switched : the addend or
-    correction that w already has; without one, a switch multiplies the energy here, whatever the potential
-    """
+    """(energy, force/r) with the truncation, from u, w without it at squared distances r2; scalars or vectors. u
+    already includes the constant of `terms`. inverse : 1/r, if `needs_root`. switched : the switch term or correction
+    that w already includes; without one, a switch multiplies the energy here, for any potential"""
     raise TypeError("compiled code only")
 
 
 def needs_root(truncation, switched) -> bool:
-    """Whether a force with an ending needs 1/r, by their Numba types."""
+    """Whether a truncated force needs 1/r, by the Numba types."""
     return not is_a(truncation, Unmodified) and not is_a(switched, SwitchCorrection)
 
 
@@ -247,7 +240,7 @@ def _truncated(truncation, terms, switched, r2, inverse, u, w):
         return bent
 
     factor = quintic if is_a(truncation, Switched) else nonic
-    if len(switched) > 0:  # the root is for the energy alone
+    if len(switched) > 0:  # only the energy needs the root
         return lambda truncation, terms, switched, r2, inverse, u, w: (
             factor(truncation, r2 * inverse_square_root(r2))[0] * u,
             w,
@@ -260,9 +253,9 @@ def _truncated(truncation, terms, switched, r2, inverse, u, w):
     return multiplied
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def truncation_polynomial(terms, x):
-    """(energy, force) that an ending adds at x = r - start >= 0, without its constant."""
+    """(energy, force) that truncation terms add at x = r - start >= 0, without the constant."""
     linear = terms[1]
     quadratic = terms[2]
     cubic = terms[3]
@@ -270,7 +263,7 @@ def truncation_polynomial(terms, x):
     return -1.0 * x * (linear + x2 * (quadratic / 3 + x * (cubic / 4))), linear + x2 * (quadratic + x * cubic)
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def quintic(truncation, r):
     """(S, dS/dr) of S = 1 - 10 t³ + 15 t⁴ - 6 t⁵, with t of `switch_coordinate`."""
     t = switch_coordinate(truncation, r)
@@ -279,7 +272,7 @@ def quintic(truncation, r):
     return 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t)), slope
 
 
-@kernel(inline=True, outer=True)
+@kernel(inline=True, from_python=True)
 def nonic(truncation, r):
     """(S, dS/dr) of S = 1 - 126 t⁵ + 420 t⁶ - 540 t⁷ + 315 t⁸ - 70 t⁹, with t of `switch_coordinate`."""
     t = switch_coordinate(truncation, r)
