@@ -5,16 +5,8 @@ from collections.abc import Callable
 from math import inf
 from pathlib import Path
 
-from rigidmd.commands.arguments import (
-    Commands,
-    add_command,
-    add_output_folder,
-    add_scene,
-    command_line,
-    progress_bar,
-    read_scene,
-)  # fmt: skip
-from rigidmd.commands.streams import announce
+from rigidmd.commands.arguments import Commands, add_command, add_output_folder, add_scene, command_line, read_scene
+from rigidmd.commands.streams import announce, progress_bar
 
 
 def add(commands: Commands) -> None:

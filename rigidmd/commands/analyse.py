@@ -5,7 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import Commands, add_command, progress_bar, time_ps
+from rigidmd.commands.arguments import Commands, add_command, time_ps
+from rigidmd.commands.streams import progress_bar
 
 if TYPE_CHECKING:
     from rigidmd.analysis.files import AnalysisRequest

@@ -1,4 +1,4 @@
-"""Parts that commands share: exit codes, arguments, and the reading of their scene."""
+"""Arguments that several commands have, and the reading of scenes."""
 
 import argparse
 import re
@@ -7,19 +7,10 @@ import sys
 from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-if TYPE_CHECKING:
-    from tqdm import tqdm
+from typing import Any, TypeAlias
 
 #: What the function `add` of each command is given.
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-
-#: Added to the number of a signal that ends a command: exit code 130 for Ctrl-C, 143 for SIGTERM.
-BY_SIGNAL = 128
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, BY_SIGNAL + 2
-#: Exit code of a run that stopped because its wall time was up: run it again with --resume.
-OUT_OF_TIME = 75
 
 
 def add_command(
@@ -153,13 +144,6 @@ def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[
 def command_line() -> str:
     """The command line of this process."""
     return shlex.join(["rigidmd", *sys.argv[1:]])
-
-
-def progress_bar(form: str = "{l_bar}{bar}| [{elapsed}<{remaining}]", total: float = 1.0) -> "tqdm":
-    """A bar on a terminal, which disappears at its end."""
-    from tqdm import tqdm
-
-    return tqdm(total=total, disable=None, leave=False, bar_format=form)
 
 
 def print_page(path: Path, notes: list[str]) -> None:

@@ -1,7 +1,6 @@
 """`rigidmd`: the list of commands, the parsing of the command line, the messages and exit codes of errors.
 
-Each command has a module: its arguments (`add`), its call, and what it prints. Commands compute nothing. Modules import
-what they need inside functions, so that `rigidmd --help` loads none of it.
+Commands compute nothing. Modules import what they need inside functions, so that `rigidmd --help` loads none of it.
 """
 
 import argparse
@@ -11,14 +10,14 @@ import warnings
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 
-from rigidmd.commands.arguments import BAD_INPUT, FAILED, INTERRUPTED
+from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
-#: The modules of the commands, in the order of `rigidmd --help`.
+#: The modules of the commands, in the order of `rigidmd --help`; view adds report, too.
 COMMANDS = (
     "examples", "new", "run", "resume", "compare", "energy", "check", "export", "verify", "accuracy", "stability",
-    "analyse", "sweep", "report", "view", "film", "gallery", "models", "schema", "help",
+    "analyse", "sweep", "view", "film", "gallery", "models", "schema", "help",
 )  # fmt: skip
 
 EXAMPLES = """examples:

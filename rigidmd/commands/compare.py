@@ -4,7 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
-from rigidmd.commands.arguments import FAILED, Commands, add_command
+from rigidmd.commands import FAILED
+from rigidmd.commands.arguments import Commands, add_command
 
 
 def add(commands: Commands) -> None:

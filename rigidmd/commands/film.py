@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import Commands, add_command, add_run_folder, file_about_run, number, progress_bar
+from rigidmd.commands.arguments import Commands, add_command, add_run_folder, file_about_run, number
+from rigidmd.commands.streams import progress_bar
 
 
 def add(commands: Commands) -> None:

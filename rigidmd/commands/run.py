@@ -4,17 +4,8 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import (
-    BY_SIGNAL,
-    OUT_OF_TIME,
-    Commands,
-    add_command,
-    add_engine,
-    add_scene,
-    read_scene,
-    seconds,
-    time_ps,
-)  # fmt: skip
+from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
+from rigidmd.commands.arguments import Commands, add_command, add_engine, add_scene, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
 
 

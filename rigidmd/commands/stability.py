@@ -3,7 +3,9 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import FAILED, Commands, add_command, add_output_folder, command_line, progress_bar
+from rigidmd.commands import FAILED
+from rigidmd.commands.arguments import Commands, add_command, add_output_folder, command_line
+from rigidmd.commands.streams import progress_bar
 
 
 def add(commands: Commands) -> None:

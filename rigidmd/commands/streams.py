@@ -1,13 +1,16 @@
-"""Standard output and standard error: messages, and streams that are closed, full, or without a reader."""
+"""Standard output and standard error: messages, progress, and streams that are closed, full, or without a reader."""
 
 import contextlib
 import io
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rigidmd.errors import OutputError, visible
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 
 def announce(message: str) -> None:
@@ -17,6 +20,13 @@ def announce(message: str) -> None:
 
 def warn(message: str) -> None:
     print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
+
+
+def progress_bar(form: str = "{l_bar}{bar}| [{elapsed}<{remaining}]", total: float = 1.0) -> "tqdm":
+    """A bar on a terminal, which disappears at its end."""
+    from tqdm import tqdm
+
+    return tqdm(total=total, disable=None, leave=False, bar_format=form)
 
 
 def open_streams() -> None:

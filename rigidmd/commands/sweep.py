@@ -7,19 +7,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigidmd.commands.arguments import (
-    BY_SIGNAL,
-    FAILED,
-    INTERRUPTED,
-    OUT_OF_TIME,
-    Commands,
-    add_command,
-    add_output_folder,
-    add_trust,
-    command_line,
-    number,
-    seconds,
-)  # fmt: skip
+from rigidmd.commands import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME
+from rigidmd.commands.arguments import Commands, add_command, add_output_folder, add_trust, number, seconds
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import visible
 
@@ -145,7 +134,7 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
         if point.folder in outcome.failed:
             print(f"  failed: {point.folder}: {visible(point.message or '')}")
     if outcome.failed or outcome.left:
-        again = command_line().replace(" --force", "")
+        again = shlex.join(["rigidmd", *sys.argv[1:]]).replace(" --force", "")
         print(f"  the same command continues with what is left, and repeats what failed: {again}")
     if outcome.signal is not None:
         return BY_SIGNAL + outcome.signal

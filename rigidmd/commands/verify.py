@@ -3,7 +3,8 @@
 import argparse
 import json
 
-from rigidmd.commands.arguments import FAILED, Commands, add_command, add_engine, add_scene, read_scene
+from rigidmd.commands import FAILED
+from rigidmd.commands.arguments import Commands, add_command, add_engine, add_scene, read_scene
 
 
 def add(commands: Commands) -> None:

@@ -2,16 +2,13 @@
 
 import time as clock
 from collections.abc import Callable
-from functools import cache
 from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError
-from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run import Simulation
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene, Scene
@@ -103,39 +100,6 @@ def run_body(
     return outcome_of(run)
 
 
-def rotation_error(rotation: np.ndarray) -> Callable[[Results], float]:
-    """A function that computes the largest entry of |Q - Q_known| at the end."""
-    return lambda results: np.abs([[results[f"q{i}{j}"][-1] for j in (1, 2, 3)] for i in (1, 2, 3)] - rotation).max()
-
-
-def invariants_error(results: Results) -> float:
-    """Largest relative error of L along the lab's axes and of |L|, and orthogonality error; not of the energy."""
-    wrong = results.summary["largest_relative_error"]
-    return max([results.summary["largest_orthogonality_error"], *(e for name, e in wrong.items() if name != "energy")])
-
-
-def conserved_error(results: Results) -> float:
-    """Largest relative error of all conserved quantities, and orthogonality error."""
-    return max(invariants_error(results), results.summary["largest_relative_error"].get("energy", 0.0))
-
-
-def free_rotation(inertia, omega, span: float) -> np.ndarray:
-    """Q of a free body at the end, by DOP853 on Euler's equations and a quaternion; its error is 1e-13 per radian."""
-    i1, i2, i3 = (float(i) for i in inertia)
-    k1, k2, k3 = (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
-
-    def rates(t, y):
-        a, b, c, w, x, y, z = y.tolist()
-        return (
-            k1 * b * c, k2 * c * a, k3 * a * b,
-            -0.5 * (x * a + y * b + z * c), 0.5 * (w * a + y * c - z * b),
-            0.5 * (w * b + z * a - x * c), 0.5 * (w * c + x * b - y * a),
-        )  # fmt: skip
-
-    found = solve_ivp(rates, (0.0, span), [*omega, 1.0, 0.0, 0.0, 0.0], "DOP853", rtol=1e-13, atol=1e-14)
-    return from_quaternion(found.y[3:, -1])
-
-
 def molecules_scene(
     molecules: list[dict],
     box: dict,
@@ -203,33 +167,3 @@ def run_invalid(data: dict) -> Outcome:
         return Outcome(nan, 0.0)
 
     return outcome_of(run)
-
-
-WATERS, WATER_FORCES = 64, {"cutoff_A": 6.0}
-
-
-@cache
-def liquid(model: str, temperature: float, step: float, steps: int) -> State:
-    """A state of water after these steps (fs) at a temperature (K), from a lattice."""
-    with np.errstate(all="ignore"):
-        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_thermostat(temperature, step))).state
-
-
-def weak_thermostat(temperature: float, step: float) -> dict:
-    """A thermostat with a time of 20 steps (fs)."""
-    return {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
-
-
-def water_scene(model: str, *settings, **more) -> dict:
-    """`molecules_scene` of a box of water. TIP4P of 1983 is not a shipped model."""
-    kind = {"name": "tip4p", "sites": TIP4P} if model == "tip4p" else {"model": model}
-    box = {"density_g_cm3": 0.997}
-    return molecules_scene([kind | {"count": WATERS}], box, *settings, forces=WATER_FORCES, **more)
-
-
-TIP4P = [
-    {"name": "OW", "element": "O", "mass_u": 15.9994, "position_A": [0.0] * 3, "sigma_A": 3.154, "epsilon_K": 78.0},
-    {"name": "HW1", "element": "H", "mass_u": 1.008, "position_A": [0.756950, 0.585882, 0.0], "charge_e": 0.52},
-    {"name": "HW2", "element": "H", "mass_u": 1.008, "position_A": [-0.756950, 0.585882, 0.0], "charge_e": 0.52},
-    {"name": "MW", "mass_u": 0.0, "position_A": [0.0, 0.15, 0.0], "charge_e": -1.04},
-]

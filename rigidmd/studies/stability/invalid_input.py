@@ -13,7 +13,7 @@ from rigidmd.studies.stability.cases import (
     run_invalid,
     run_molecules,
 )
-from rigidmd.studies.stability.collisions import BOX, FORCES, bent, from_file, pair_of
+from rigidmd.studies.stability.molecules import BOX, FORCES, bent, from_file, pair_of
 from rigidmd.studies.stability.outcomes import REFUSED, CaseResult
 
 

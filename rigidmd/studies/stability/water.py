@@ -1,6 +1,7 @@
-"""Stability cases: water from 0 K to 1e5 K, its longest steps, and equipartition."""
+"""Stability cases: water from 0 K to 1e5 K, its longest steps, equipartition, the thermostat."""
 
-from math import hypot
+from functools import cache
+from math import hypot, sqrt
 
 import numpy as np
 
@@ -9,25 +10,49 @@ from rigidmd.core.statistics import mean
 from rigidmd.studies.stability.cases import (
     QUICK,
     SPLIT,
-    WATERS,
-    liquid,
     molecules_scene,
     outcome_of,
     register_case,
     run_molecules,
     simulate,
-    water_scene,
-    weak_thermostat,
 )
-from rigidmd.studies.stability.collisions import bent
+from rigidmd.studies.stability.molecules import WATER_FORCES, bent
 from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
-#: Steps (fs) for water; the first is nominal.
-STEPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
-#: Published: TIP4P at 300 K becomes unstable near 10 fs (Davidchack 2010, J. Comput. Phys. 229, 9323).
-PUBLISHED = 10.0
+WATERS = 64
 FREEDOM = 6 * WATERS - 3
+#: Steps (fs); the first is nominal.
+STEPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
+#: TIP4P at 300 K becomes unstable near this step, fs (Davidchack 2010, J. Comput. Phys. 229, 9323).
+PUBLISHED = 10.0
+
+
+@cache
+def liquid(model: str, temperature: float, step: float, steps: int) -> State:
+    """A state of water after these steps (fs) at a temperature (K), from a lattice."""
+    with np.errstate(all="ignore"):
+        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_thermostat(temperature, step))).state
+
+
+def weak_thermostat(temperature: float, step: float) -> dict:
+    """A thermostat with a time of 20 steps (fs)."""
+    return {"temperature_K": float(temperature), "thermostat_time_ps": 20 * step / 1000}
+
+
+def water_scene(model: str, *settings, **more) -> dict:
+    """`molecules_scene` of a box of water. TIP4P of 1983 is not a shipped model."""
+    kind = {"name": "tip4p", "sites": TIP4P} if model == "tip4p" else {"model": model}
+    box = {"density_g_cm3": 0.997}
+    return molecules_scene([kind | {"count": WATERS}], box, *settings, forces=WATER_FORCES, **more)
+
+
+TIP4P = [
+    {"name": "OW", "element": "O", "mass_u": 15.9994, "position_A": [0.0] * 3, "sigma_A": 3.154, "epsilon_K": 78.0},
+    {"name": "HW1", "element": "H", "mass_u": 1.008, "position_A": [0.756950, 0.585882, 0.0], "charge_e": 0.52},
+    {"name": "HW2", "element": "H", "mass_u": 1.008, "position_A": [-0.756950, 0.585882, 0.0], "charge_e": 0.52},
+    {"name": "MW", "mass_u": 0.0, "position_A": [0.0, 0.15, 0.0], "charge_e": -1.04},
+]
 
 
 @register_case(9, x="temperature (K)", error="energy error over kinetic energy (at 1 K, of that at 0 K)", step="fs")
@@ -125,3 +150,26 @@ def equipartition(result: CaseResult, quick: bool) -> None:
                 return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
 
             result.add(f"{setting}, {step:g} fs", outcome_of(run), 4.0, SPLIT, step, step)
+
+
+@register_case(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
+def thermostat(result: CaseResult, quick: bool) -> None:
+    """The thermostat with dt / tau from 1e-12 to 1e6: little heat when weak, the canonical mean when strong."""
+    state = liquid("spce", 298.0, 1.0, 500)
+    for ratio in (1e-12, 1e6) if quick else [10.0**k for k in range(-12, 7, 3)]:
+        step, steps = 0.5, 200
+        heat = {"temperature_K": 298.0, "thermostat_time_ps": step / 1000 / ratio}
+        data = water_scene("spce", step, steps, SPLIT, 298.0, heat, samples=steps)
+        weak = steps * ratio < 1e-3
+
+        def error(results, weak=weak, ratio=ratio, steps=steps) -> float:
+            kinetic = results["kinetic"]
+            heat_added = np.abs(results["energy"] - results["conserved"]).max() / kinetic[0]
+            if weak:  # heat in a step: at most some ten standard deviations of its noise, 2 sqrt(dt/tau / FREEDOM)
+                return heat_added / (10 * sqrt(4 * ratio * steps / FREEDOM))
+            if ratio < 1:
+                return 0.0 if np.isfinite(kinetic).all() else np.inf
+            mean = kinetic[1:].mean() / (0.5 * FREEDOM * 298.0 * 0.008314462618)
+            return abs(mean - 1) / sqrt(2 / FREEDOM / steps)
+
+        result.add(f"dt/tau = {ratio:.0e}", run_molecules(data, state, error), 1.0 if weak else 5.0, SPLIT, ratio, step)
