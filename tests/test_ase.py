@@ -178,7 +178,7 @@ def test_what_a_scene_of_atoms_is_without_being_told():
     assert given.stages[0].ensemble == "nvt"
     assert given.structure.velocities
     water.set_constraint([FixBondLengths([(0, 1)]), FixAtoms([0])])
-    with pytest.warns(RigidMDWarning, match=r"not taken over \(FixAtoms\)"):
+    with pytest.warns(RigidMDWarning, match=r"are ignored \(FixAtoms\)"):
         rigidmd.scene_from_atoms(water, "spce")
 
 
@@ -232,9 +232,9 @@ def broken(what: str) -> Atoms:
         ("nan", r"atoms\[4\] has a position that is not a finite number"),
         ("inf", r"atoms\[0\] has a momentum that is not a finite number"),
         ("mixed", "they are periodic along a, b only: set pbc along all three axes or none"),
-        ("flat", "they are periodic, but of their cell: with its edges of 20, 20, 0 Å it is 0 Å thin"),
+        ("flat", "they are periodic, but their cell is invalid: with its edges of 20, 20, 0 Å it is 0 Å thick"),
         ("nan cell", "it has an edge that is not a finite number"),
-        ("empty", "there are none"),
+        ("empty", "there are no atoms"),
         ("missing", r"molecule 2 \(atoms 4 to 5, by bonding distance\) has atoms O H, expected spce \(O H2\)"),
         ("other", r"has atoms named S, which are in no molecule of the scene: spce \(O H2\)"),
         ("bent", r"molecule 1 .* is not spce: an atom is .* Å from the rigid template"),
@@ -290,7 +290,7 @@ def test_frames_of_a_run(results):
     ideal = model.mass[model.species] @ (state.velocity**2).sum(axis=1) / (3 * state.volume)
     pressure = (ideal / EV - atoms.get_stress()[:3].mean()) / units.bar
     assert pressure == pytest.approx(results["pressure_bar"][-1], rel=1e-7)
-    with pytest.raises(IndexError, match="there is no frame 4: this run has 4"):
+    with pytest.raises(IndexError, match="frame 4 is out of range: this run has 4"):
         results.atoms(4)
     for wrong in (1.5, "first", "1:2:3:4", "::0", ""):
         with pytest.raises(ValueError, match="must be a number, a slice or a text"):
@@ -463,7 +463,7 @@ def test_rigid_molecules_are_minimised(waters):
 def test_bent_molecules_are_told_once():
     atoms = molecule("H2O")
     atoms.calc = RigidMD("spce")
-    with pytest.warns(RigidMDWarning, match=r"an atom is 0\.056 Å from its place in a rigid molecule, 6% of"):
+    with pytest.warns(RigidMDWarning, match=r"an atom is 0\.056 Å from its position in a rigid molecule, 6% of"):
         atoms.get_potential_energy()
     atoms.rattle(0.001)
     with warnings.catch_warnings():
@@ -474,7 +474,7 @@ def test_bent_molecules_are_told_once():
         fresh = RigidMD("spce")
         fresh.get_potential_energy(atoms)
     atoms.positions[1] += 0.3
-    with pytest.raises(StructureError, match=r"is no spce(.|\n)*They fitted before: hold the molecules rigid"):
+    with pytest.raises(StructureError, match=r"is not spce(.|\n)*They matched before: keep the molecules rigid"):
         atoms.get_potential_energy()
     atoms.positions[1] -= 0.3
     assert atoms.get_potential_energy() == pytest.approx(0.0, abs=1e-12)
@@ -505,7 +505,7 @@ def test_a_scene_may_be_the_calculator(results, waters):
     atoms = waters.copy()
     atoms.calc = RigidMD(results.system.scene)
     assert atoms.get_potential_energy() == pytest.approx(waters.get_potential_energy(), rel=1e-12)
-    with pytest.raises(SceneError, match="the scene says them"):
+    with pytest.raises(SceneError, match="set by the scene"):
         RigidMD(results.system.scene, cutoff_A=5.0)
     with pytest.raises(SceneError, match="is of a single body"):
         RigidMD(Scene.read(ROOT / "systems" / "heavy_top_1.toml"))

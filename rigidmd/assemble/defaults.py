@@ -24,7 +24,7 @@ from rigidmd.forces.ewald.errors import (
 )
 from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.forces.neighbors.space import Space, Triclinic, cell_of
-from rigidmd.io.cells import basis_in_words, edges_in_words
+from rigidmd.io.cells import describe_basis, describe_cell
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import Forces, default_switch_start
@@ -253,7 +253,7 @@ def _ewald(
     if grid is not None and len(set(grid)) > 1 and not composition.has_given_cell:
         fault = (
             f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the "
-            f"equivalent cell with {edges_in_words(cell)}, {basis_in_words(composition.basis)}. Give this cell as the "
+            f"equivalent cell with {describe_cell(cell)}, {describe_basis(composition.basis)}. Give this cell as the "
             "box, or three equal numbers, or leave pme_grid out"
         )
         return numbers, [fault], None

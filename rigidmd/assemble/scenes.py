@@ -1,25 +1,23 @@
-"""What a scene becomes: with every default filled in, and its start as an `ase.Atoms`."""
+"""Public functions on scenes: with all defaults, to the start as an `ase.Atoms`, and from an `ase.Atoms`.
 
-from typing import TYPE_CHECKING, TypeVar
+The atoms of such a scene are an embedded structure file, extended XYZ with every digit.
+"""
 
-from rigidmd.assemble.body import build_body
-from rigidmd.assemble.build import build
-from rigidmd.io.ase_atoms import atoms_of_system
-from rigidmd.scene import BodyScene, MolecularScene
-
-if TYPE_CHECKING:
-    import ase
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Unpack, cast
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import numpy as np
 
+from rigidmd.assemble.body import build_body
+from rigidmd.assemble.build import build
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
-from rigidmd.io.cells import cell_fault
+from rigidmd.io.ase_atoms import atoms_of_system
+from rigidmd.io.cells import cell_error
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
+from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.molecules import STRUCTURE_NAME, Settings
 from rigidmd.scene.species import SPECIES_FILES
 
@@ -27,12 +25,16 @@ if TYPE_CHECKING:
     import ase
 
 AnyScene = TypeVar("AnyScene", MolecularScene, BodyScene)
+DURATION = 1.0  # ps, of the stage of a scene without [[stages]]
+SOURCE = "atoms"  # in messages
+#: Constraints that a rigid molecule fulfils.
+SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 
 def resolve(scene: AnyScene) -> AnyScene:
-    """The same scene with every number that a run of it uses; it runs to the same bits.
+    """The same scene with all defaults, which runs to the same bits.
 
-    An integrator that is "auto" stays so until a run has chosen one. Raises SceneError, and for molecules
+    The integrator "auto" stays until a run has chosen one. Raises SceneError, and for molecules
     StructureError and MoleculeError.
     """
     return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
@@ -44,26 +46,20 @@ def atoms_of(scene: MolecularScene) -> "ase.Atoms":
     return atoms_of_system(system, system.state)
 
 
-#: Duration of a first stage that nobody asked for, ps.
-DURATION = 1.0
-#: What messages call them.
-SOURCE = "atoms"
-
-
 def scene_from_atoms(
     atoms: "ase.Atoms", models: str | Sequence[str | Mapping[str, Any]], **settings: Unpack[Settings]
 ) -> MolecularScene:
-    """The scene of an `ase.Atoms`, whose atoms become molecules as those of a structure file do.
+    """The scene of an `ase.Atoms`, whose atoms become molecules like the atoms of a structure file.
 
-    Its cell, its periodicity (along all axes or none) and its momenta are taken. Massless sites, as the M of TIP4P,
-    need not be among the atoms. The scene holds the atoms; a run in a folder writes them there.
+    Cell, periodicity (along all axes or none) and momenta are used. Massless sites, such as M of TIP4P, need not be
+    among the atoms. The scene contains the atoms; a run in a folder writes them there.
 
     models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file
     settings : the other tables and keys of a scene file: forces={"cutoff_A": 9.0}, stages=[{...}], seed=3.
-        start={"temperature_K": 300} draws momenta in place of those of the atoms. Without stages there is one: 1 ps
-        of nve, or a minimisation where neither atoms nor settings give momenta
+        start={"temperature_K": 300} draws momenta instead of using the atoms' momenta. Default of stages: 1 ps of nve,
+        or a minimisation if neither atoms nor settings give momenta
 
-    Raises SceneError; that the atoms are no molecules of these models is found when the system is built.
+    Raises SceneError. Atoms that do not match the models are found when the system is built.
     """
     if faults := atoms_faults(atoms):
         raise SceneError(SOURCE, faults)
@@ -84,19 +80,18 @@ def scene_from_atoms(
     data["molecules"] = _entries(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
     _warn_of_constraints(atoms)
-    found = MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
-    return cast(MolecularScene, found)
+    return MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
 
 
 def atoms_faults(atoms: Any) -> list[str]:
-    """Why an object is no `ase.Atoms` of which molecules could be made."""
+    """Messages on an object that is not an `ase.Atoms`, or cannot consist of molecules."""
     import ase
 
     if not isinstance(atoms, ase.Atoms):
         more = "; ase.io.read returns a list of them for ':'" if isinstance(atoms, list) else ""
         return [f"are of the type {type(atoms).__name__}, must be one ase.Atoms{more}"]
     if len(atoms) == 0:
-        return ["there are none"]
+        return ["there are no atoms"]
     values = [("position", atoms.positions)]
     if atoms.has("momenta"):
         values.append(("momentum", atoms.get_momenta()))
@@ -113,14 +108,16 @@ def atoms_faults(atoms: Any) -> list[str]:
         )
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        fault = cell_fault(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
+        fault = cell_error(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
         if fault:
-            faults.append(f"they are periodic, but of their cell: {fault}. Set atoms.cell, or atoms.pbc = False")
+            faults.append(
+                f"they are periodic, but their cell is invalid: {fault}. Set atoms.cell, or atoms.pbc = False"
+            )
     return faults
 
 
 def text_of(atoms: "ase.Atoms") -> str:
-    """Atoms as extended XYZ, every number to the last bit; a cell only if they are periodic."""
+    """Atoms as extended XYZ with all digits of numbers, and with a cell if they are periodic."""
     columns = [("species", "S", [[symbol] for symbol in atoms.get_chemical_symbols()])]
     columns.append(("pos", "R", _digits(atoms.positions)))
     if atoms.has("momenta"):
@@ -134,7 +131,7 @@ def text_of(atoms: "ase.Atoms") -> str:
     about = ":".join(f"{name}:{kind}:{len(rows[0])}" for name, kind, rows in columns)
     box = 'pbc="F F F"'
     if atoms.pbc.all():
-        # ASE takes a number without a point for a whole one
+        # ASE reads a number without a point as an integer
         [edges] = _digits(atoms.cell.array.reshape(1, 9))
         edges = " ".join(text if "." in text else f"{float(text):.16e}" for text in edges)
         box = f'Lattice="{edges}" pbc="T T T"'
@@ -143,26 +140,22 @@ def text_of(atoms: "ase.Atoms") -> str:
 
 
 def _digits(values: np.ndarray) -> list[list[str]]:
-    """The shortest texts of numbers (n, k) that are read as the same numbers."""
+    """The shortest texts of numbers (n, k) that reproduce all bits."""
     return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
 
 
 def _faults_of_tables(data: Mapping[str, Any]) -> list[str]:
-    """Faults of tables that the atoms fill in."""
-    faults = [
-        f"{key} is a {type(data[key]).__name__}, must be a dictionary like the table [{key}] of a scene file"
-        for key in ("structure", "start", "box")
-        if not isinstance(data[key], Mapping)
-    ]
-    if faults:
-        return faults
-    return [
-        f"structure.{key} is given by the atoms" for key in ("file", "frame", "topology") if key in data["structure"]
-    ]
+    """Messages on tables that the atoms fill in."""
+    wrong = {key: type(data[key]) for key in ("structure", "start", "box") if not isinstance(data[key], Mapping)}
+    if wrong:
+        must = "must be a dictionary like the table"
+        return [f"{key} is a {kind.__name__}, {must} [{key}] of a scene file" for key, kind in wrong.items()]
+    given = [key for key in ("file", "frame", "topology") if key in data["structure"]]
+    return [f"structure.{key} is given by the atoms" for key in given]
 
 
 def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Tables [[molecules]] of models. Files are absolute, or the scene would depend on the working directory."""
+    """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the working directory."""
     found = []
     models = plain_values(models)
     for entry in models if isinstance(models, list) else [models]:
@@ -177,16 +170,12 @@ def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, 
 
 
 def _warn_of_constraints(atoms: "ase.Atoms") -> None:
-    """Warn of constraints that hold more than the shape of molecules."""
-    held = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
-    if held:
+    """Warn of constraints on more than the shape of molecules."""
+    ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
+    if ignored:
         warnings.warn(
-            f"the constraints of the atoms are not taken over ({', '.join(held)}): molecules stay put that the models "
-            'call frozen, models=[{"model": "spce", "frozen": [1, 2]}]',
+            f"the constraints of the atoms are ignored ({', '.join(ignored)}): freeze molecules by the models, "
+            'models=[{"model": "spce", "frozen": [1, 2]}]',
             RigidMDWarning,
             stacklevel=4,
         )
-
-
-#: Constraints that a rigid molecule fulfils by itself.
-SHAPES = {"FixLinearTriatomic", "FixInternals"}

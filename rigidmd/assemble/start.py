@@ -13,7 +13,7 @@ from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.io.cells import cell_fault
+from rigidmd.io.cells import cell_error
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES
@@ -27,7 +27,7 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
     if scene.structure is not None:
         start, content = scene.structure, scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if content is None else Path(start.file)
-        if scene.box.cell is not None and (fault := cell_fault(scene.box.cell)):
+        if scene.box.cell is not None and (fault := cell_error(scene.box.cell)):
             raise SceneError(scene.source, [f"box: {fault}"])
         try:
             found = read_structure(
@@ -54,7 +54,7 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
     cell = scene.box.cell
     if cell is None:
         cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
-    if fault := cell_fault(cell):
+    if fault := cell_error(cell):
         raise SceneError(scene.source, [f"box: {fault}"])
     rng = np.random.default_rng([scene.seed, LATTICE])
     n = sum(counts)

@@ -14,12 +14,12 @@ from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.io.atoms import SAME_MASS, Atoms
 from rigidmd.io.cells import (
     angles_deg,
-    basis_in_words,
     basis_of,
-    cell_fault,
-    edges_in_words,
+    cell_error,
+    describe_basis,
+    describe_cell,
     least_skewed_cell,
-    reduced,
+    reduced_cell,
     right_angled,
     same_lattice,
     standard_rotation,
@@ -81,7 +81,7 @@ def read_structure(
             notes.append("the box of the scene is used, not the box of the file")
     else:
         cell = found.cell
-    if cell is not None and (fault := cell_fault(cell)):
+    if cell is not None and (fault := cell_error(cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
     found = found._replace(cell=cell, notes=tuple(notes))
     if repeat != (1, 1, 1):
@@ -99,13 +99,13 @@ def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Con
     """
     if found.cell is None:
         return found
-    cell, rotation = least_skewed_cell(found.cell) if may_rotate else (reduced(found.cell), np.eye(3))
+    cell, rotation = least_skewed_cell(found.cell) if may_rotate else (reduced_cell(found.cell), np.eye(3))
     if np.array_equal(cell, found.cell):
         return found
     basis = basis_of(cell @ rotation, found.cell)
     note = (
-        f"{whose} lattice is given by the cell with {edges_in_words(cell)}, {basis_in_words(basis)}, "
-        f"in place of {edges_in_words(found.cell)}"
+        f"{whose} lattice is given by the cell with {describe_cell(cell)}, {describe_basis(basis)}, "
+        f"in place of {describe_cell(found.cell)}"
     )
     if np.array_equal(rotation, np.eye(3)):
         return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
@@ -157,7 +157,7 @@ def _read_molecules(
         atoms = atoms._replace(cell=cell)
     if periodic and wanted is None:
         _check_box(path, atoms.cell, notes)
-    if atoms.cell is not None and periodic and (fault := cell_fault(atoms.cell)):
+    if atoms.cell is not None and periodic and (fault := cell_error(atoms.cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
     across = atoms.cell if atoms.cell is not None or not periodic else wanted
     matched = match(atoms, species, across, tolerance)

@@ -10,6 +10,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.files import unreadable_reason
+from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
     DEEPEST,
     TOMLDecodeError,
@@ -21,7 +22,6 @@ from rigidmd.core.toml import (
     shorten_repr,
 )
 from rigidmd.errors import SceneError
-from rigidmd.core.shipped import examples
 from rigidmd.scene.validation import (
     Section,
     did_you_mean,
