@@ -22,23 +22,7 @@ from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.thread_pool import call_address, set_threads
 
 __all__ = [
-    "BLOCKS",
-    "MOST_BLOCKS",
-    "SIMD_BITS",
-    "BoundTask",
-    "Code",
-    "CompiledTask",
-    "NumbaStruct",
-    "TaskArguments",
-    "call",
-    "call_address",
-    "call_blocks",
-    "compile_together",
-    "implements",
-    "is_a",
-    "kernel",
-    "load_arguments",
-    "pack_arguments",
-    "set_threads",
-    "task",
-]
+    "BLOCKS", "MOST_BLOCKS", "SIMD_BITS", "BoundTask", "Code", "CompiledTask", "NumbaStruct", "TaskArguments", "call",
+    "call_address", "call_blocks", "compile_together", "implements", "is_a", "kernel", "load_arguments",
+    "pack_arguments", "set_threads", "task",
+]  # fmt: skip

@@ -50,11 +50,9 @@ class HelperProcess:
         self._ended = False
         self._process = subprocess.Popen(
             [sys.executable, "-c", HELPER_PROGRAM],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C goes to this process, which then ends the helper
-        )
+        )  # fmt: skip
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):  # it has already ended
             self._process.stdin.write(content)

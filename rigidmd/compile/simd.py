@@ -55,6 +55,11 @@ def _address(context, builder, array_type, array, index, lanes):
     return cast_pointer(builder, address, context.get_value_type(lanes))
 
 
+def _emitted(signature, emit):
+    """An intrinsic whose code is emit(builder, ...) of its arguments."""
+    return signature, lambda context, builder, _, arguments: emit(builder, *arguments)
+
+
 def _is_contiguous(array) -> bool:
     return isinstance(array, types.Array) and array.layout == "C"
 
@@ -185,21 +190,19 @@ def _inverse_value(builder, value):
 @intrinsic
 def square_root(typing, x):
     """Square roots of a vector, accurate to about the last digit."""
-    return x(x), lambda context, builder, signature, arguments: _square_root(builder, *arguments)
+    return _emitted(x(x), _square_root)
 
 
 @intrinsic
 def _approximate_inverse_root(typing, x):
     """1/sqrt(x) in float32; LLVM may use the hardware estimate and a Newton step, with an error of 2e-7."""
-    return x(x), lambda context, builder, signature, arguments: _inverse_value(
-        builder, _square_root(builder, *arguments)
-    )
+    return _emitted(x(x), lambda b, value: _inverse_value(b, _square_root(b, value)))
 
 
 @intrinsic
 def _approximate_inverse(typing, x):
     """1/x in float32, likewise."""
-    return x(x), lambda context, builder, signature, arguments: _inverse_value(builder, *arguments)
+    return _emitted(x(x), _inverse_value)
 
 
 def _conversion(dtype):
@@ -352,13 +355,11 @@ def _root_and_cube(x):
 def pairwise_minimum(typing, x):
     """The smaller of lanes 2 k and 2 k + 1, in both lanes."""
 
-    def emit(context, builder, signature, arguments):
-        value, count = arguments[0], x.count
-        order = ir.Constant(ir.VectorType(ir.IntType(32), count), [k ^ 1 for k in range(count)])
-        neighbor = builder.shuffle_vector(value, value, order)
+    def emit(builder, value):
+        neighbor = _shuffle(builder, value, value, [k ^ 1 for k in range(x.count)])
         return builder.select(builder.fcmp_ordered("<", value, neighbor), value, neighbor)
 
-    return x(x), emit
+    return _emitted(x(x), emit)
 
 
 @intrinsic
@@ -470,21 +471,17 @@ def select(typing, mask, x, y):
 def mask_bits(typing, mask):
     """The mask as an integer, bit k for lane k."""
 
-    def emit(context, builder, signature, arguments):
-        word = builder.bitcast(arguments[0], ir.IntType(mask.count))
+    def emit(builder, value):
+        word = builder.bitcast(value, ir.IntType(mask.count))
         return builder.zext(word, ir.IntType(64)) if mask.count < 64 else word
 
-    return types.int64(mask), emit
+    return _emitted(types.int64(mask), emit)
 
 
 @intrinsic
 def lowest_bit(typing, word):
     """Index of the lowest set bit of a word that is not 0."""
-
-    def emit(context, builder, signature, arguments):
-        return builder.cttz(arguments[0], ir.IntType(1)(1))
-
-    return types.int64(types.int64), emit
+    return _emitted(types.int64(types.int64), lambda b, word: b.cttz(word, ir.IntType(1)(1)))
 
 
 @intrinsic
@@ -502,13 +499,12 @@ def mask_from_bits(typing, word, lanes):
 def sum_lanes(typing, x):
     """The sum of all lanes as a float64, added pairwise in a fixed order."""
 
-    def emit(context, builder, signature, arguments):
-        value = arguments[0]
+    def emit(builder, value):
         if x.dtype == types.float32:
             value = builder.fpext(value, ir.VectorType(ir.DoubleType(), x.count))
         return builder.extract_element(_add_halves(builder, value, 1), ir.IntType(32)(0))
 
-    return types.float64(x), emit
+    return _emitted(types.float64(x), emit)
 
 
 def _shuffle(builder, a, b, lanes):
@@ -569,21 +565,17 @@ def add_lane_sums(typing, array, index, step, x, y):
 def largest_lane(typing, x):
     """The largest of all lanes; undefined if a lane is NaN."""
 
-    def emit(context, builder, signature, arguments):
-        kind, flags = arguments[0].type, ("nnan",)
-        return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, *arguments, flags=flags)
+    def emit(builder, value):
+        kind = value.type
+        return _call(builder, f"llvm.vector.reduce.fmax.{_suffix(kind)}", kind.element, value, flags=("nnan",))
 
-    return x.dtype(x), emit
+    return _emitted(x.dtype(x), emit)
 
 
 @intrinsic
 def extract_lane(typing, x, k):
     """The number in lane k."""
-
-    def emit(context, builder, signature, arguments):
-        return builder.extract_element(arguments[0], arguments[1])
-
-    return x.dtype(x, types.intp), emit
+    return _emitted(x.dtype(x, types.intp), lambda b, vector, k: b.extract_element(vector, k))
 
 
 @intrinsic
@@ -679,10 +671,9 @@ def broadcast(typing, number, array):
     """A vector of the type of an array with the same number in every lane."""
     lanes = Lanes(array.dtype, LANE_COUNTS[array.dtype])
 
-    def emit(context, builder, signature, arguments):
-        return emit_broadcast(context, builder, arguments[0], number, lanes)
-
-    return lanes(number, array), emit
+    return lanes(number, array), lambda context, b, _, arguments: emit_broadcast(
+        context, b, arguments[0], number, lanes
+    )
 
 
 def lanes_of(array):
@@ -733,9 +724,5 @@ def permute_two(typing, low, high, index):
     if (low, high, index) != (Lanes(types.float32, 16), Lanes(types.float32, 16), Lanes(types.int32, 16)):
         return None
 
-    def emit(context, builder, signature, arguments):
-        first, second, indices = arguments
-        name = "llvm.x86.avx512.vpermi2var.ps.512"
-        return _call(builder, name, first.type, first, indices, second)
-
-    return low(low, high, index), emit
+    name = "llvm.x86.avx512.vpermi2var.ps.512"
+    return _emitted(low(low, high, index), lambda b, low, high, k: _call(b, name, low.type, low, k, high))

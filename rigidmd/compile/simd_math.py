@@ -35,6 +35,8 @@ class VectorOperations:
 
     def __init__(self, builder, lanes: Lanes):
         self.builder = builder
+        self.add, self.sub, self.mul, self.div = builder.fadd, builder.fsub, builder.fmul, builder.fdiv
+        self.negative, self.choose, self.compare = builder.fneg, builder.select, builder.fcmp_ordered
         self.bits, self.count = lanes.dtype.bitwidth, lanes.count
         self.is_double = self.bits == 64
         self.type = ir.VectorType(ir.DoubleType() if self.is_double else ir.FloatType(), self.count)
@@ -58,27 +60,6 @@ class VectorOperations:
     def fma(self, a, b, c):
         """a b + c, rounded once."""
         return self.call("fma", a, b, c)
-
-    def add(self, a, b):
-        return self.builder.fadd(a, b)
-
-    def sub(self, a, b):
-        return self.builder.fsub(a, b)
-
-    def mul(self, a, b):
-        return self.builder.fmul(a, b)
-
-    def div(self, a, b):
-        return self.builder.fdiv(a, b)
-
-    def negative(self, a):
-        return self.builder.fneg(a)
-
-    def choose(self, mask, a, b):
-        return self.builder.select(mask, a, b)
-
-    def compare(self, sign: str, a, b):
-        return self.builder.fcmp_ordered(sign, a, b)
 
     def as_bits(self, a):
         return self.builder.bitcast(a, self.whole)
@@ -216,23 +197,15 @@ def _in_double(builder, lanes: Lanes, emit, *values):
     return builder.fptrunc(emit(wide, *(builder.fpext(value, wide.type) for value in values)), narrow)
 
 
-def _root(builder, lanes, x):
-    return VectorOperations(builder, lanes).call("sqrt", x)
-
-
-def _absolute(builder, lanes, x):
-    return VectorOperations(builder, lanes).call("fabs", x)
-
-
 #: Vector versions of Python's functions: emit(builder, type, value).
 FUNCTIONS = {
     math.exp: lambda builder, lanes, x: exponential(VectorOperations(builder, lanes), x),
     math.log: lambda builder, lanes, x: logarithm(VectorOperations(builder, lanes), x),
     math.sin: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _sine(v, x, 0), x),
     math.cos: lambda builder, lanes, x: _in_double(builder, lanes, lambda v, x: _sine(v, x, 1), x),
-    math.sqrt: _root,
-    math.fabs: _absolute,
-    abs: _absolute,
+    math.sqrt: lambda builder, lanes, x: VectorOperations(builder, lanes).call("sqrt", x),
+    math.fabs: lambda builder, lanes, x: VectorOperations(builder, lanes).call("fabs", x),
+    abs: lambda builder, lanes, x: VectorOperations(builder, lanes).call("fabs", x),
     operator.neg: lambda builder, lanes, x: builder.fneg(x),
     operator.pos: lambda builder, lanes, x: x,
 }

@@ -105,17 +105,14 @@ class Scheme(_SchemeFields):
 
     @property
     def kicks(self) -> tuple[float, ...]:
-        """Fractions of its kicks."""
         return tuple(flow.fraction for flow in self.flows if flow.kind == KICK)
 
     @property
     def drifts(self) -> tuple[float, ...]:
-        """Fractions of its drifts."""
         return tuple(flow.fraction for flow in self.flows if flow.kind == DRIFT)
 
     @property
     def has_gradient(self) -> bool:
-        """Whether a kick uses the gradient of the forces."""
         return any(flow.gradient for flow in self.flows)
 
     @property

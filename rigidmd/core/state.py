@@ -76,12 +76,9 @@ NO_CELL = np.diag([inf, inf, inf])
 
 
 def state_of(
-    position: np.ndarray | None = None,
-    velocity: np.ndarray | None = None,
-    rotation: np.ndarray | None = None,
-    angular_momentum_body: np.ndarray | None = None,
-    cell: np.ndarray | None = None,
-) -> State:
+    position: np.ndarray | None = None, velocity: np.ndarray | None = None, rotation: np.ndarray | None = None,
+    angular_momentum_body: np.ndarray | None = None, cell: np.ndarray | None = None,
+) -> State:  # fmt: skip
     """A state at time 0 with contiguous copies of these arrays; by default at rest and without a box.
 
     Without position it is a pinned body; without rotation, points.

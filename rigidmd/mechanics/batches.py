@@ -19,12 +19,8 @@ AXIS_A, AXIS_B, COMMON, RATE, LARGEST_RATE2, HANDEDNESS, ROWS = 0, 1, 2, 3, 6, 7
 @kernel
 def kick_group(species, inverse_mass, inverse_inertia, state, body_load, first, end, h):
     """V += h F/m, L += h n_body of molecules first ... end - 1; axes without inertia keep their momentum."""
-    velocity, momentum, force, torque = (
-        state.velocity,
-        state.angular_momentum_body,
-        body_load.force,
-        body_load.torque_body,
-    )
+    velocity, momentum = state.velocity, state.angular_momentum_body
+    force, torque = body_load.force, body_load.torque_body
     kinds = np.full(LANES, -1)
     velocity_factors, torque_factors = np.empty(3 * LANES), np.empty(3 * LANES)
     rotates = len(momentum) > 0
@@ -65,10 +61,8 @@ def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, 
         if rotates:
             rotation_sums = _with_squares(rotation_sums, inverses, momentum, 3 * first)
         first += LANES
-    translational, rotational = (
-        sum_lanes(translation_sums[0] + translation_sums[1] + translation_sums[2]),
-        sum_lanes(rotation_sums[0] + rotation_sums[1] + rotation_sums[2]),
-    )
+    translational = sum_lanes(translation_sums[0] + translation_sums[1] + translation_sums[2])
+    rotational = sum_lanes(rotation_sums[0] + rotation_sums[1] + rotation_sums[2])
     for m in range(first, end):
         kind = species[m]
         for k in range(3):
@@ -102,7 +96,7 @@ def scale_group(values, first, end, scale):
 
 @kernel
 def apply_langevin_group(model, state, keep, keep_momentum, noise, numbers, first, end):
-    """Friction and noise: v <- keep v + size xi, and so the angular momenta, of molecules first ... end - 1.
+    """Friction and noise: v <- keep v + size xi, and likewise angular momenta, of molecules first ... end - 1.
 
     noise (species, 4) : sizes along each axis of a body, and that of a velocity. numbers (6 k,) : number j of molecule
     first + m is numbers[k j + m]; three for its velocity, then three for its angular momentum. Returns the kinetic
@@ -197,9 +191,8 @@ def _rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h
                 _rotate_lanes(constants, about, rotation, angular_momentum_body, first, momentum)
             else:
                 common = load(constants, COMMON * LANES)
-                rotated = _rotate_about_momenta(
-                    load_matrices(rotation, first), (common * x, common * y, common * z), -1.0
-                )
+                along = (common * x, common * y, common * z)
+                rotated = _rotate_about_momenta(load_matrices(rotation, first), along, -1.0)
                 store_matrices(rotation, first, rotated)
             first += LANES
         _rotate_one_by_one(rotor, species, rotation, angular_momentum_body, first, end, h)
@@ -238,9 +231,8 @@ def _set_constants(constants, kinds, rotor, h):
         constants[RATE * LANES + n] = h * rates[a]
         constants[(RATE + 1) * LANES + n] = h * rates[b]
         constants[(RATE + 2) * LANES + n] = h * rates[c]
-        constants[LARGEST_RATE2 * LANES + n] = (
-            max(abs(common), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c])) ** 2
-        )
+        fastest = max(abs(common), abs(h * rates[a]), abs(h * rates[b]), abs(h * rates[c]))
+        constants[LARGEST_RATE2 * LANES + n] = fastest**2
         constants[HANDEDNESS * LANES + n] = -1.0 if (b - a) % 3 == 1 else 1.0
         about_a |= rates[a] != 0.0
         about_b |= rates[b] != 0.0

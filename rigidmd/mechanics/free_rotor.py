@@ -141,9 +141,8 @@ def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
     rotate_about_momentum(rotation, angular_momentum_body, m, h * rotor.common[species])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
     excess = rotor.excess[species]
-    rotate_about_axes(
-        rotation, angular_momentum_body, m, (a, b, c), (excess[a], excess[b], excess[c]), (0.0, 0.0, 0.0), h
-    )
+    rates = (excess[a], excess[b], excess[c])
+    rotate_about_axes(rotation, angular_momentum_body, m, (a, b, c), rates, (0.0, 0.0, 0.0), h)
 
 
 @kernel

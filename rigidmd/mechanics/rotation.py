@@ -18,11 +18,9 @@ def from_quaternion(quaternion_wxyz: np.ndarray) -> np.ndarray:
     q = np.asarray(quaternion_wxyz, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     return _matrix(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     )
 
 
@@ -45,12 +43,10 @@ def to_quaternion(rotation: np.ndarray) -> np.ndarray:
     wy, yw = q[..., 0, 2] - q[..., 2, 0], q[..., 0, 2] + q[..., 2, 0]
     wz, zw = q[..., 1, 0] - q[..., 0, 1], q[..., 1, 0] + q[..., 0, 1]
     products = _matrix(
-        [
-            [1 + xx + yy + zz, wx, wy, wz],
-            [wx, 1 + xx - yy - zz, zw, yw],
-            [wy, zw, 1 - xx + yy - zz, xw],
-            [wz, yw, xw, 1 - xx - yy + zz],
-        ]
+        [1 + xx + yy + zz, wx, wy, wz],
+        [wx, 1 + xx - yy - zz, zw, yw],
+        [wy, zw, 1 - xx + yy - zz, xw],
+        [wz, yw, xw, 1 - xx - yy + zz],
     )
     largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
     row = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
@@ -69,11 +65,9 @@ def from_euler_angles(euler_angles: np.ndarray) -> np.ndarray:
     """Q = Rz(phi) Rx(theta) Rz(psi) (..., 3, 3) of 3-1-3 Euler angles (..., 3) = (phi, theta, psi)."""
     (cf, ct, cp), (sf, st, sp) = _cosines_and_sines(euler_angles)
     return _matrix(
-        [
-            [cf * cp - sf * ct * sp, -cf * sp - sf * ct * cp, sf * st],
-            [sf * cp + cf * ct * sp, -sf * sp + cf * ct * cp, -cf * st],
-            [st * sp, st * cp, ct],
-        ]
+        [cf * cp - sf * ct * sp, -cf * sp - sf * ct * cp, sf * st],
+        [sf * cp + cf * ct * sp, -sf * sp + cf * ct * cp, -cf * st],
+        [st * sp, st * cp, ct],
     )
 
 
@@ -96,11 +90,9 @@ def from_yaw_pitch_roll(yaw_pitch_roll: np.ndarray) -> np.ndarray:
     """Q = Rz(yaw) Ry(pitch) Rx(roll) (..., 3, 3) of the 3-2-1 angles (..., 3) = (yaw, pitch, roll)."""
     (cy, cp, cr), (sy, sp, sr) = _cosines_and_sines(yaw_pitch_roll)
     return _matrix(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
     )
 
 
@@ -123,19 +115,15 @@ def hat(vector: np.ndarray) -> np.ndarray:
     """Skew matrices (..., 3, 3) of vectors (..., 3): hat(a) b = a x b, so that dQ/dt = Q hat(omega_body)."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=float), -1, 0)
     zero = np.zeros_like(x)
-    return _matrix([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return _matrix([zero, -z, y], [z, zero, -x], [-y, x, zero])
 
 
 def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """omega (..., 3), body frame, from 3-1-3 angles (..., 3) and their time derivatives (..., 3), rad per time."""
     (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
     phi_dot, theta_dot, psi_dot = np.moveaxis(np.asarray(rates, dtype=float), -1, 0)
-    return np.stack(
-        np.broadcast_arrays(
-            phi_dot * st * sp + theta_dot * cp, phi_dot * st * cp - theta_dot * sp, phi_dot * ct + psi_dot
-        ),
-        axis=-1,
-    )
+    omega = phi_dot * st * sp + theta_dot * cp, phi_dot * st * cp - theta_dot * sp, phi_dot * ct + psi_dot
+    return np.stack(np.broadcast_arrays(*omega), axis=-1)
 
 
 def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> np.ndarray:
@@ -197,7 +185,7 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
     return u @ vt
 
 
-def _matrix(rows: list[list[np.ndarray]]) -> np.ndarray:
+def _matrix(*rows: list[np.ndarray]) -> np.ndarray:
     """Matrices (..., m, n) from m rows of n entries (...)."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
