@@ -6,8 +6,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F1", "g(r): the mean volume of the run, not that of each frame",
         "analysis/structure.py",
-        "    return counts * float(history.volume[frame]) / (",
-        "    return counts * float(history.volume.mean()) / (",
+        "    return counts * float(frames.volume[frame]) / (",
+        "    return counts * float(frames.volume.mean()) / (",
         ("test_mixtures.py::test_pairs_of_a_mixture_are_counted_against_the_pairs_that_there_are",),
     ),
     Mutation(
@@ -34,8 +34,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F5", "profile of the density: its axis has the component of the edge for the height of the cell",
         "analysis/structure.py",
-        "    height = float(np.mean([heights(cell)[k] for cell in history.cell]))\n",
-        "    height = float(np.mean([cell[k, k] for cell in history.cell]))\n",
+        "    height = float(np.mean([heights(cell)[k] for cell in frames.cell]))\n",
+        "    height = float(np.mean([cell[k, k] for cell in frames.cell]))\n",
         ("test_mixtures.py::test_the_profile_of_a_mixture_is_that_of_its_rotated_sites",),
     ),
     Mutation(

@@ -281,7 +281,7 @@ RINGS = [
     Mutation(
         "B23", "hydrogen bonds: O-H is not rotated with its molecule",
         "analysis/structure.py",
-        "arm.append(np.broadcast_to(turn @ (body[hydrogen] - body[site]), centre.shape))",
+        "arm.append(np.broadcast_to(rotation @ (body[hydrogen] - body[site]), centre.shape))",
         "arm.append(np.broadcast_to(body[hydrogen] - body[site], centre.shape))",
         ("test_mixtures.py::test_hydrogen_bonds_of_a_mixture_are_those_of_its_geometry",),
     ),

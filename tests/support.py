@@ -227,7 +227,7 @@ HOMES = {
     "analysis.rotation": "PER_CM orientation spectrum",
     "io.atoms": "Frame element_of element_of_mass",
     "assemble.body": "build_body",
-    "io.cells": "basis_in_words basis_of pairs_within reduced standard_rotation",
+    "io.cells": "describe_basis basis_of pairs_within reduced_cell standard_rotation",
     "assemble.describe": "describe",
     "io.formats.gsd": "GsdReader",
     "dynamics.momenta": "draw_momenta mobile remove_momentum",

@@ -24,8 +24,8 @@ from support import (
     orientation,
     random_rotations,
     rdf,
-    rebuilt,
-    settled,
+    fit_frames,
+    converged_value,
     small_scene,
     spectrum,
     squared_displacement,
@@ -98,7 +98,7 @@ def test_rigid_bodies_come_back_from_their_sites(mixture):
     sites = np.array([mixture.site_positions(state) for state in told])
     velocities = np.array([mixture.site_velocities(state) for state in told])
     cells = np.array([state.cell for state in told])
-    found, notes = rebuilt(mixture, sites, velocities, cells, wrapped=False)
+    found, notes = fit_frames(mixture, sites, velocities, cells, wrapped=False)
     assert notes == []
     position, Q, V, L = (
         np.array([getattr(state, name) for state in told])
@@ -135,16 +135,16 @@ def test_wrapped_paths_become_continuous(mixture):
         moved.append(now)
     cells = np.array([now.cell for now in moved])
     whole, wrapped = (
-        rebuilt(mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put)
+        fit_frames(mixture, np.array([mixture.site_positions(now, put) for now in moved]), None, cells, put)
         for put in (False, True)
     )
     assert np.abs(np.diff(whole[0].position, axis=0) - np.diff(wrapped[0].position, axis=0)).max() < 1e-10
     assert np.ptp(whole[0].position, axis=0).max() > 30.0
-    assert wrapped[1] == ["frames hold wrapped molecules; their paths were made continuous"]
+    assert wrapped[1] == ["molecules are wrapped in the frames; their paths were made continuous"]
     assert wrapped[0].velocity is None and wrapped[0].L is None
     far = np.array([mixture.site_positions(now, True) for now in moved[::12]])
     with pytest.raises(OutputError, match=r"move by 0\.\d\d of the box between two frames, .* wrapped"):
-        rebuilt(mixture, far, None, cells[:4], True)
+        fit_frames(mixture, far, None, cells[:4], True)
 
 
 def test_paths_are_unwrapped_by_the_cell_of_each_frame(mixture):
@@ -156,7 +156,7 @@ def test_paths_are_unwrapped_by_the_cell_of_each_frame(mixture):
     ]
     cells = np.array([now.cell for now in moved])
     sites = np.array([mixture.site_positions(now, True) for now in moved])
-    found, _ = rebuilt(mixture, sites, None, cells, wrapped=True)
+    found, _ = fit_frames(mixture, sites, None, cells, wrapped=True)
     inside = np.einsum("fni,fij->fnj", found.position, np.linalg.inv(cells))
     assert np.abs(inside - inside[0]).max() < 1e-12
     assert np.ptp(found.position, axis=0).max() > 10.0
@@ -170,13 +170,13 @@ def test_torn_molecules_are_found(mixture):
     with pytest.raises(
         OutputError, match=r"frame 2: a site of molecule 16 is \d+ Å away from its position in the rigid spce"
     ):
-        rebuilt(mixture, sites, None, np.array([state.cell] * 2), wrapped=False)
+        fit_frames(mixture, sites, None, np.array([state.cell] * 2), wrapped=False)
 
 
 def test_rounding_of_files_leaves_molecules_whole(mixture):
     (state,) = states(mixture, 1)
     rough = np.round(mixture.site_positions(state), 2)
-    found, _ = rebuilt(mixture, rough[None], None, state.cell[None], wrapped=False)
+    found, _ = fit_frames(mixture, rough[None], None, state.cell[None], wrapped=False)
     assert np.abs(found.position[0] - state.position).max() < 0.01
 
 
@@ -200,7 +200,7 @@ def test_times_of_files_are_even_though_rounded():
     time = (10_000 + 0.004 * np.arange(50)).astype(np.float32).astype(float)
     assert history(system, time, None).interval == pytest.approx(0.004, rel=0.01)
     assert history(system, [0.0, 1.0, 3.0], None).interval is None
-    with pytest.raises(OutputError, match=r"needs frames at equal times; here they are 1 to 2 ps apart"):
+    with pytest.raises(OutputError, match=r"needs frames at equal intervals; these are 1 to 2 ps"):
         msd(history(system, [0.0, 1.0, 3.0], None))
     with pytest.raises(OutputError, match="needs at least 20 frames; there are 19"):
         msd(history(system, np.arange(19.0), None))
@@ -488,21 +488,21 @@ def test_what_hardly_turns_or_turns_too_fast_gives_no_time():
     )
     wild = random_rotations(rng, 800).reshape(100, 8, 3, 3)
     told = orientation(history(system, time, None, np.eye(3) * 40, wild)).value("D_rot of ccl4, axis 1")
-    assert told.value is None and "between frames, 1 ps apart: write them more often" in told.note
-    with pytest.raises(OutputError, match="no molecule of this run turns"):
+    assert told.value is None and "between frames, every 1 ps: write more of them" in told.note
+    with pytest.raises(OutputError, match="no molecule of this run rotates"):
         orientation(history(system_of({"argon": 2}), time, None, np.eye(3) * 40))
 
 
 def test_one_sentence_tells_what_is_too_short():
-    assert settled("x", "D", 1.0, 0.1, 11.0, 1.0).note == (
+    assert converged_value("x", "D", 1.0, 0.1, 11.0, 1.0).note == (
         "11 ps are 11 correlation times of 1 ps, too short for a value; 20 of them are 20 ps. So far: 1.00 ± 0.10 D"
     )
-    assert settled("x", "", 1.0, None, 40.0, 1.0).note == "too short for an error. So far: 1"
-    assert settled("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
-    assert settled("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
-    assert settled("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
-    assert settled("x", "", np.nan, 0.1, 5.0, 1.0).value is None
-    assert settled("x", "", 1.0, 0.1, 5.0, 0.0).value is None
+    assert converged_value("x", "", 1.0, None, 40.0, 1.0).note == "too short for an error. So far: 1"
+    assert converged_value("x", "", 1.0, 0.1, 20.0, 1.0).value == 1.0
+    assert converged_value("x", "", 1.0, 0.1, 5.0, 1.0, least=5.0).value == 1.0
+    assert converged_value("x", "", 1.0, 0.1, 4.9, 1.0, least=5.0).value is None
+    assert converged_value("x", "", np.nan, 0.1, 5.0, 1.0).value is None
+    assert converged_value("x", "", 1.0, 0.1, 5.0, 0.0).value is None
 
 
 def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
@@ -530,7 +530,7 @@ def test_an_oscillation_has_its_wave_number_and_its_degrees_of_freedom():
         assert memory[5] == pytest.approx(np.cos(2 * np.pi * PER_CM * wave_number * 5 * interval), abs=0.02)
     with pytest.raises(OutputError, match="needs velocities"):
         spectrum(history(system, time, None, np.eye(3) * 30, Q))
-    with pytest.raises(OutputError, match=r"frames 0\.016 ps apart .* spce axis 2 forgets itself"):
+    with pytest.raises(OutputError, match=r"frames every 0\.016 ps .* spce axis 2 decays"):
         every = slice(None, None, 4)  # V and one of three angular velocities would do
         spectrum(history(system, time[every], None, np.eye(3) * 30, Q[every], velocities[every], L[every]))
 

@@ -18,7 +18,7 @@ from support import (
     ROOT,
     build,
     gmx,
-    of_folder,
+    frames_of_folder,
     read_record,
     registry,
     small_scene,
@@ -123,7 +123,7 @@ def test_the_list_is_that_of_all(capsys):
 
 def test_results_in_memory_and_from_the_folder_agree(water):
     results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     for name, options, column in (
         ("rdf", {"first": "OW", "second": "HW", "width": 0.2}, "g OW-HW"),
         ("structure_factor", {"name": "OW", "largest": 3.0}, "S OW"),
@@ -154,17 +154,17 @@ def test_a_file_of_the_pressure_tensor_is_read_with_care(copy):
     rng = np.random.default_rng(0)
     rows = [",".join(map(repr, [round(0.02 + 0.004 * k, 9), *rng.normal(0, 500, 6).tolist()])) for k in range(10)]
     (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows]) + "\n" + rows[0][:-30])
-    history = of_folder(read_record(copy), 0.02)
+    history = frames_of_folder(read_record(copy), 0.02)
     assert history.tensor.shape == (10, 7)  # the line that is cut is left out
     (copy / "pressure_tensor.csv").write_text("\n".join([lines[0], *rows, "0,x,0,0,0,0,0"]) + "\n")
-    with pytest.raises(OutputError, match=r"pressure_tensor.csv: column .* holds what is no number"):
-        of_folder(read_record(copy))
+    with pytest.raises(OutputError, match=r"pressure_tensor.csv: column .* has a cell that is not a number"):
+        frames_of_folder(read_record(copy))
     (copy / "pressure_tensor.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(OutputError, match=r"is no pressure tensor of rigidmd: its columns must be"):
-        of_folder(read_record(copy))
+    with pytest.raises(OutputError, match=r"is not a pressure tensor of rigidmd: its columns must be"):
+        frames_of_folder(read_record(copy))
     (copy / "pressure_tensor.csv").write_text("")
-    with pytest.raises(OutputError, match=r"is no pressure tensor of rigidmd"):
-        of_folder(read_record(copy))
+    with pytest.raises(OutputError, match=r"is not a pressure tensor of rigidmd"):
+        frames_of_folder(read_record(copy))
 
 
 # other programs on the very same frames
@@ -172,7 +172,7 @@ def test_a_file_of_the_pressure_tensor_is_read_with_care(copy):
 
 def test_g_of_r_is_that_of_mdanalysis(water):
     u = MDAnalysis.Universe(str(water / "topology.gro"), str(water / "trajectory.trr"))
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     first = len(u.trajectory) - len(history)
     assert len(history) == 51
     for a, b, block in (("OW", "OW", (1, 1)), ("OW", "HW", (1, 2)), ("HW", "HW", (2, 2))):
@@ -186,7 +186,7 @@ def test_g_of_r_is_that_of_mdanalysis(water):
 def test_displacements_are_those_of_mdanalysis(water):
     u = MDAnalysis.Universe(str(water / "topology.gro"), str(water / "trajectory.trr"))
     u.add_TopologyAttr("masses", np.tile(build(Scene.read(ROOT / "systems" / "water.toml")).species[0].masses, 216))
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     first = len(u.trajectory) - len(history)
     centres = np.array([u.atoms.center_of_mass(compound="residues") for _ in u.trajectory[first:]])
     assert np.abs(centres - history.positions).max() < 1e-5
@@ -223,7 +223,7 @@ def xvg(path):
 
 @needs_gromacs
 def test_g_of_r_is_that_of_gromacs(water, topology):
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     for a, b in (("OW", "OW"), ("OW", "HW")):
         other = {"OW": "OW", "HW": "HW1_HW2"}
         gmx(topology, "rdf", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-n", "run.ndx", "-o", "rdf.xvg",
@@ -240,7 +240,7 @@ def test_g_of_r_is_that_of_gromacs(water, topology):
 
 @needs_gromacs
 def test_displacements_are_those_of_gromacs(water, topology):
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     gmx(topology, "trjconv", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-b", "0.0199", "-t0", "0",
         "-timestep", "1", "-o", "slow.trr", text="System\n")  # as it does not find times again that are no whole numbers  # fmt: skip
     gmx(topology, "msd", "-f", "slow.trr", "-s", "run.tpr", "-n", "run.ndx", "-o", "msd.xvg",
@@ -253,7 +253,7 @@ def test_displacements_are_those_of_gromacs(water, topology):
 
 @needs_gromacs
 def test_the_total_dipole_is_that_of_gromacs(water, topology):
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     gmx(topology, "dipoles", "-f", str(water / "trajectory.trr"), "-s", "run.tpr", "-n", "run.ndx", "-o", "Mtot.xvg",
         "-b", "0.0199", "-xvg", "none", "-temp", "300", text="System\n")  # fmt: skip
     _, x, y, z, _ = xvg(topology / "Mtot.xvg")
@@ -268,7 +268,7 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--only", "rfd"], "there is no analysis 'rfd'; did you mean rdf? there are"),
+        (["--only", "rfd"], "unknown analysis 'rfd'; did you mean rdf? there are"),
         (["--only", "viscosty"], "did you mean viscosity?"),
         (["--from", "1ns"], "from 1000 ps on there are 0 of 56 frames; an analysis needs two at least"),
         (["--from", "0.22ps"], "from 0.22 ps on there is 1 of 56 frames"),
@@ -300,16 +300,16 @@ def test_a_viscosity_without_sense_is_refused(value, water, capsys):
 
 
 def test_names_of_sites_are_suggested(water):
-    history = of_folder(read_record(water), 0.02)
+    history = frames_of_folder(read_record(water), 0.02)
     rdf = registry.selected(["rdf"])[0].function
-    with pytest.raises(OutputError, match=r"^there is no site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce$"):
+    with pytest.raises(OutputError, match=r"^unknown site 'ow'; did you mean OW\? there are OW, HW1, HW2, spce$"):
         rdf(history, "OW", "ow")
-    with pytest.raises(OutputError, match=r"^there is no site 'Xe'; there are OW"):
+    with pytest.raises(OutputError, match=r"^unknown site 'Xe'; there are OW"):
         rdf(history, "Xe")
     for largest, width in ((20.0, 0.1), (-1.0, 0.1), (5.0, 0.0), (5.0, 6.0), (np.nan, 0.1), (5.0, np.nan)):
         with pytest.raises(OutputError, match=r"is not possible: half the box is 9\.3"):
             rdf(history, "OW", largest=largest, width=width)
-    with pytest.raises(OutputError, match="there is no axis 'w'; name x, y or z"):
+    with pytest.raises(OutputError, match="unknown axis 'w'; name x, y or z"):
         registry.selected(["density_profile"])[0].function(history, "w")
     with pytest.raises(OutputError, match="bins"):
         registry.selected(["density_profile"])[0].function(history, "z", bins=0)
@@ -340,7 +340,7 @@ def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
     (copy / "trajectory.trr").write_bytes(b"nothing")
     assert "cannot be read as a trajectory" in said(capsys, copy)
     (copy / "trajectory.trr").unlink()
-    assert "its trajectory trajectory.trr is not there" in said(capsys, copy)
+    assert "its trajectory trajectory.trr is missing" in said(capsys, copy)
     scene = (copy / "scene.toml").read_text()
     (copy / "scene.toml").write_text(
         scene.replace('trajectory = "trajectory.trr"', "trajectory = false").replace("velocities = true", "")
@@ -368,7 +368,7 @@ def test_a_damaged_table_is_told_and_kept(text, copy, capsys):
 
 def test_files_of_others_are_not_overwritten(copy, capsys):
     (copy / "msd.csv").write_text("mine\n")
-    assert f"{copy / 'msd.csv'} is there and no file of an analysis" in said(
+    assert f"{copy / 'msd.csv'} exists and is not of an analysis" in said(
         capsys, copy, "--only", "msd", "--from", "0.02ps"
     )
     assert (copy / "msd.csv").read_text() == "mine\n" and not (copy / "analysis.json").exists()
@@ -378,8 +378,8 @@ def test_files_of_others_are_not_overwritten(copy, capsys):
     assert cli.main(["analyse", str(copy), "--only", "msd,dielectric", "--from", "0.02ps"]) == 0
     trusted = copy.parent / "own.py"
     for name, words in (
-        ("log", "log.csv is there and no file"),
-        ("dipole", "dipole.csv is of the analysis dielectric"),
+        ("log", "log.csv exists and is not"),
+        ("dipole", "dipole.csv is a file of the analysis dielectric"),
     ):
         trusted.write_text(f"import rigidmd\n@rigidmd.analysis.register\ndef {name}(frames):\n    return frames.time\n")
         before = {path.name: path.read_bytes() for path in copy.iterdir()}
@@ -420,7 +420,7 @@ def test_a_function_of_ones_own_is_found_by_name(copy, capsys):
     assert cli.main(["analyse", str(copy), *trust, "--only", "height,spins"]) == 0
     entries = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert entries["height"]["about"] == "mean height of the centres (A)"
-    columns, history = table(copy / "height.csv"), of_folder(read_record(copy), 0.02)
+    columns, history = table(copy / "height.csv"), frames_of_folder(read_record(copy), 0.02)
     assert columns["height"] == pytest.approx(history.positions[:, :, 2].mean(axis=1), rel=1e-8)
     assert list(table(copy / "spins.csv")) == ["Time (ps)", "L", "one"]
     assert entries["spins"]["values"][1]["value"] == 1.0
@@ -453,13 +453,13 @@ def lambda_of(series):
     ("body", "words"),
     [
         ("return 1 / 0", "the analysis mine raised ZeroDivisionError: division by zero"),
-        ("return 1.0", "must give one number for each of the 51 frames, or a dictionary of such arrays; 'mine' has the shape ()"),
+        ("return 1.0", "must return one number for each of the 51 frames, or a dictionary of such arrays; 'mine' has the shape ()"),
         ("return frames.positions", "has the shape (51, 216, 3)"),
         ("return {'a': frames.time, 'b': frames.time[1:]}", "'b' has the shape (50,)"),
-        ("return {}", "gave an empty dictionary"),
-        ("return frames.time * float('nan')", "'mine' is no finite number at frame 1"),
-        ("return ['x'] * len(frames)", "must give one number"),
-        ("return None", "must give one number"),
+        ("return {}", "returned an empty dictionary"),
+        ("return frames.time * float('nan')", "'mine' is not a finite number at frame 1"),
+        ("return ['x'] * len(frames)", "must return one number"),
+        ("return None", "must return one number"),
         ("raise SystemExit(0)", "raised SystemExit"),
     ],
 )  # fmt: skip
@@ -492,7 +492,7 @@ def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
 
 def test_the_names_of_analyses_are_kept_for_them():
     registry.selected([])
-    assert {name for name, entry in registry.KNOWN.items() if not entry.own} == set(registry.ORDER)
+    assert {name for name, entry in registry.KNOWN.items() if not entry.is_user} == set(registry.ORDER)
 
 
 def test_a_pressure_tensor_needs_a_box():
@@ -517,10 +517,10 @@ def text_run(tmp_path_factory):
     ("spoil", "words"),
     [
         (lambda frames: [*frames[:9], [frames[9][0].replace("648", "647"), *frames[9][1:-1]], *frames[10:]], "frame 10 of 16 is not one of 648 sites"),
-        (lambda frames: [*frames[:9], [*frames[9][:2], "OW nan 0 0", *frames[9][3:]], *frames[10:]], "no finite number"),
+        (lambda frames: [*frames[:9], [*frames[9][:2], "OW nan 0 0", *frames[9][3:]], *frames[10:]], "not finite numbers"),
         (lambda frames: [*frames[:9], [*frames[9][:2], "OW 900.0 0 0", *frames[9][3:]], *frames[10:]], "frame 5: a site of molecule 1 is"),
         (lambda frames: frames[:6], "from 0.02 ps on there is 1 of 6 frames; an analysis needs two at least"),
-        (lambda frames: [*frames[:9], *frames[10:]], "needs frames at equal times; here they are 0.004 to 0.008 ps apart"),
+        (lambda frames: [*frames[:9], *frames[10:]], "needs frames at equal intervals; these are 0.004 to 0.008 ps"),
     ],
     ids=["number", "nan", "torn", "one", "uneven"],
 )  # fmt: skip
@@ -534,11 +534,11 @@ def test_frames_that_are_spoilt_are_told(spoil, words, text_run, tmp_path, capsy
 
 def test_friction_on_each_molecule_is_told(water):
     record = read_record(water)
-    assert "thermostat" not in " ".join(of_folder(record, 0.02).notes)
+    assert "thermostat" not in " ".join(frames_of_folder(record, 0.02).notes)
     stages = tuple(s.model_copy(update={"ensemble": "nvt", "thermostat": "langevin"}) for s in record.scene.stages)
     scene = record.molecules.scene.model_copy(update={"stages": stages})
     columns = record.columns | {"stage_name": np.full(len(record.columns["time"]), "nvt")}
-    told = of_folder(replace(record, system=replace(record.molecules, scene=scene), columns=columns), 0.02).notes
+    told = frames_of_folder(replace(record, system=replace(record.molecules, scene=scene), columns=columns), 0.02).notes
     assert "the thermostat langevin acts on each molecule" in " ".join(told)
 
 
@@ -552,6 +552,6 @@ def test_stages_of_one_name_are_told_apart(tmp_path):
     Simulation(small_scene({"argon": 20}, 25.0, stages=stages, output=output), tmp_path / "run").run()
     record = read_record(tmp_path / "run")
     assert np.bincount(record.columns["stage"].astype(int)).tolist() == [3, 20]
-    found = of_folder(record)
+    found = frames_of_folder(record)
     assert found.stage.ensemble == "nve"
     assert 0.02 - 1e-6 < found.time[0] < found.time[-1] == pytest.approx(0.22)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import (
-    History,
+    RigidFrames,
     build,
     density_profile,
     dielectric,
@@ -33,7 +33,7 @@ IMAGES = np.array(list(product((-1, 0, 1), repeat=3)), float)
 
 def history(system, time, positions, cell, Q, velocities=None, L=None):
     """Frames as they are given, at 300 K."""
-    return History(
+    return RigidFrames(
         system, system.scene.stages[-1], time, np.broadcast_to(cell, (len(time), 3, 3)), positions, Q, velocities, L,
         {"temperature": np.full(len(time), 300.0)},
     )  # fmt: skip

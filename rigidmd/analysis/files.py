@@ -1,85 +1,90 @@
-"""Files of analyses in the folder of a run: analysis.json, a CSV file and a figure for each curve; and reading them."""
+"""Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each curve."""
 
 import csv
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
-from rigidmd.analysis.findings import Curve, Finding, Value
-from rigidmd.analysis.history import History
-from rigidmd.analysis.registry import ORDER, place
+from rigidmd.analysis.registry import ORDER, analysis_order, selected
+from rigidmd.analysis.result import AnalysisResult, Curve, Value
+from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.source import frames_of_folder
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import COLORS, FAINT, INK, bare_axis, few_decades, thin_series, write_figure
 from rigidmd.io.folder import add_to_folder, written_by_runs
 from rigidmd.io.run_files import Bounded, read_columns, read_json
 from rigidmd.io.write import nine_digits, write_csv, write_json
+from rigidmd.run.record import read_record
 
 ANALYSIS = "analysis.json"
-#: Inches of a figure, and curves that one holds.
+#: Size of a figure, inches, and most curves in it.
 WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
-#: Headers of columns that are kept in the file and not drawn.
+#: Headers of columns that are in the file and not drawn.
 UNDRAWN = re.compile(r"n .+-.+")
 
 
-def stretch_of(history: History) -> dict[str, Any]:
-    """What analysis.json tells of the frames that were used."""
-    return {
-        "stage": history.stage.label,
-        "from_ps": float(history.time[0]),
-        "to_ps": float(history.time[-1]),
-        "frames": len(history),
-        "notes": history.notes,
-    }
+def describe_range(frames: RigidFrames) -> dict[str, Any]:
+    """The part of analysis.json on the frames that were used."""
+    begin, end = float(frames.time[0]), float(frames.time[-1])
+    return {"stage": frames.stage.label, "from_ps": begin, "to_ps": end, "frames": len(frames), "notes": frames.notes}
 
 
-def write_findings(
-    folder: Path, stretch: dict[str, Any], findings: list[Finding], failed: dict[str, str]
+def write_results(
+    folder: Path, frames_used: dict[str, Any], results: list[AnalysisResult], failed: dict[str, str]
 ) -> list[Path]:
-    """Write what was found; entries of other analyses that the folder holds stay. Returns the files.
+    """Write results; entries of other analyses in the folder stay. Returns the files. Raises OutputError.
 
-    stretch : see `stretch_of`. failed : analysis -> the sentence that tells why it found nothing. Raises OutputError.
+    frames_used : see `describe_range`; failed : analysis -> a sentence on why it has failed
     """
     known = read_table(folder)
     owner = {name: analysis for analysis, entry in known.items() for name in entry["files"]}
     marked = written_by_runs(folder)
-    own = {}
-    for finding in findings:
-        for name in (f"{curve.file}{ending}" for curve in finding.curves for ending in (".csv", ".png")):
-            if own.setdefault(name, finding.name) != finding.name or owner.get(name, finding.name) != finding.name:
-                other = own[name] if own[name] != finding.name else owner[name]
-                raise OutputError(f"{folder / name} is of the analysis {other}; name {finding.name} otherwise")
-            known_there = name in owner or (finding.name in ORDER and name in marked)
+    new = {}
+    for result in results:
+        for name in (f"{curve.file}{suffix}" for curve in result.curves for suffix in (".csv", ".png")):
+            if new.setdefault(name, result.name) != result.name or owner.get(name, result.name) != result.name:
+                other = new[name] if new[name] != result.name else owner[name]
+                raise OutputError(f"{folder / name} is a file of the analysis {other}; rename {result.name}")
+            known_there = name in owner or (result.name in ORDER and name in marked)
             if (folder / name).exists() and not known_there:
-                raise OutputError(f"{folder / name} is there and no file of an analysis; name {finding.name} otherwise")
-    add_to_folder(folder, [ANALYSIS, *own])
+                raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
+    add_to_folder(folder, [ANALYSIS, *new])
     written, pictures = [], {}
     entries = dict(known)
-    for finding in findings:
+    for result in results:
         files = []
-        for curve in finding.curves:
+        for curve in result.curves:
             path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
             write_csv(path, _rows(curve), csv.QUOTE_NONNUMERIC)
             pictures[picture] = curve
             written += [path, picture]
             files += [path.name, picture.name]
-        entries[finding.name] = {
-            "about": finding.about,
-            "values": [value._asdict() for value in finding.values],
-            "notes": finding.notes,
-            "curves": [_described(curve) for curve in finding.curves],
+        entries[result.name] = {
+            "about": result.about,
+            "values": [value._asdict() for value in result.values],
+            "notes": result.notes,
+            "curves": [_described(curve) for curve in result.curves],
             "files": files,
-            "stretch": stretch,
+            "stretch": frames_used,
         }
-    for name, why in failed.items():
-        entries[name] = {"about": name, "values": [], "notes": [why], "curves": [], "files": [], "stretch": stretch}
-    entries = dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
+    for name, reason in failed.items():
+        entries[name] = {
+            "about": name,
+            "values": [],
+            "notes": [reason],
+            "curves": [],
+            "files": [],
+            "stretch": frames_used,
+        }
+    entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for picture, curve in pictures.items():
-        write_figure(picture, partial(drawn, curve))
+        write_figure(picture, partial(draw_curve, curve))
     return [folder / ANALYSIS, *(path for path in written if path.is_file())]
 
 
@@ -88,7 +93,7 @@ def _described(curve: Curve) -> dict[str, Any]:
 
 
 def _rows(curve: Curve) -> list[list[Any]]:
-    """Rows of the curve's file: the axis, each column, and after it its error where it has one."""
+    """Rows of the file of a curve: the axis, the columns, each followed by its error if there is one."""
     columns = {curve.axis[0]: curve.axis[1]}
     for header, values in curve.columns.items():
         columns[header] = values
@@ -115,7 +120,7 @@ class _Value(BaseModel):
     note: str = ""
 
 
-class _Stretch(BaseModel):
+class _FramesUsed(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     stage: str
@@ -131,7 +136,7 @@ class _Entry(BaseModel):
     notes: list[str]
     curves: list[_Curve]
     files: list[str]
-    stretch: _Stretch
+    frames_used: _FramesUsed = Field(alias="stretch")
 
 
 class _Analyses(BaseModel):
@@ -141,36 +146,36 @@ class _Analyses(BaseModel):
 
 
 def read_table(folder: Path) -> dict[str, Any]:
-    """The entries of analysis.json by analysis; empty without one. Raises OutputError."""
+    """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
     found = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
-    return {} if found is None else found.model_dump()["analyses"]
+    return {} if found is None else found.model_dump(by_alias=True)["analyses"]
 
 
-def read_findings(folder: Path) -> list[tuple[Finding, str]]:
-    """What analyses found in the folder of a run, each with its stretch in words. Raises OutputError."""
+def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
+    """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises OutputError."""
     found = []
     for name, entry in read_table(folder).items():
-        curves = [_read_curve(folder, told) for told in entry["curves"]]
+        curves = [_read_curve(folder, curve) for curve in entry["curves"]]
         values = [Value(**value) for value in entry["values"]]
-        stretch = entry["stretch"]
-        words = f"{stretch['frames']} frames from {stretch['from_ps']:g} to {stretch['to_ps']:g} ps"
-        found.append((Finding(name, entry["about"], values, curves, entry["notes"]), words))
+        used = entry["stretch"]
+        phrase = f"{used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps"
+        found.append((AnalysisResult(name, entry["about"], values, curves, entry["notes"]), phrase))
     return found
 
 
-def _read_curve(folder: Path, told: dict[str, Any]) -> Curve:
-    path = folder / f"{Path(told['file']).name}.csv"
+def _read_curve(folder: Path, described: dict[str, Any]) -> Curve:
+    path = folder / f"{Path(described['file']).name}.csv"
     read = read_columns(path)
     if read is None or not read.cells:
-        raise OutputError(f"{path} cannot be read: there is no curve in it; analyse again")
+        raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
     head = list(read.cells)
     table = {title: read.numbers(title) for title in head}
     columns = {title: table[title] for title in head[1:] if title.removesuffix(" error") not in set(head) - {title}}
     errors = {title.removesuffix(" error"): table[title] for title in head[1:] if title not in columns}
-    return Curve(**told | {"axis": (head[0], table[head[0]]), "columns": columns, "errors": errors})
+    return Curve(**described | {"axis": (head[0], table[head[0]]), "columns": columns, "errors": errors})
 
 
-def drawn(curve: Curve):
+def draw_curve(curve: Curve):
     """The figure of a curve: each column with a band of one standard error."""
     from rigidmd.figures.picture import Picture
 
@@ -203,3 +208,54 @@ def drawn(curve: Curve):
             handlelength=1.4, labelcolor=INK,
         )  # fmt: skip
     return figure
+
+
+#: Fraction of the progress for reading frames.
+READING = 0.25
+
+
+class AnalysisRequest(NamedTuple):
+    """Names of analyses (all if empty), start (ps) and viscosity (mPa s), or None."""
+
+    names: list[str]
+    start: float | None = None
+    viscosity: float | None = None
+
+
+class AnalysisOutput(NamedTuple):
+    """failed : analysis -> why it has failed, if it was not requested by name"""
+
+    frames: RigidFrames
+    results: list[AnalysisResult]
+    failed: dict[str, str]
+    files: list[Path]
+
+
+def analyse_folder(
+    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object] = lambda fraction, name: None
+) -> AnalysisOutput:
+    """Analyse the run in a folder and write the files into it. Raises OutputError.
+
+    An analysis that is not possible is left out with a sentence, unless it was requested by name.
+
+    progress : called with the fraction done and the name of the present work
+    """
+    entries = selected(request.names)
+    reading = lambda fraction: progress(READING * fraction, "reading frames")  # noqa: E731
+    reading(0.0)
+    frames = frames_of_folder(read_record(folder), request.start, reading)
+    results, failed = [], {}
+    for k, entry in enumerate(entries):
+        progress(READING + (1 - READING) * k / len(entries), entry.name)
+        more = {"viscosity_mPa_s": request.viscosity} if entry.name == "diffusion" else {}
+        try:
+            results.append(entry.function(frames, **more))
+        except OutputError as error:
+            if request.names:
+                raise OutputError(f"{folder}: {error}") from None
+            failed[entry.name] = str(error)
+    if not results:
+        raise OutputError(f"{folder}: no analysis is possible: {'; '.join(failed.values())}")
+    files = write_results(folder, describe_range(frames), results, failed)
+    progress(1.0, "")
+    return AnalysisOutput(frames, results, failed, files)

@@ -6,24 +6,24 @@ a frame for 4096 waters within 10 Å.
 
 import numpy as np
 
-from rigidmd.compile import Code, call_blocks, kernel, opened, packed, task
+from rigidmd.compile import Code, call_blocks, kernel, load_arguments, pack_arguments, task
 
-#: Parts of the sites that are counted independently.
+#: Parts of the sites that are counted independently, by tasks.
 PARTS = 64
-#: Cells in the largest distance, and at most for each site.
+#: Cells per largest distance, and most cells per site.
 WITHIN, FOR_EACH = 2, 8
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def _count(code, content):
-    call_blocks(code, "count", packed(content), PARTS)
+    call_blocks(code, "count", pack_arguments(content), PARTS)
 
 
 @task()
-def _count_part(parcel, part):
+def _count_part(task_arguments, part):
     """Add to counts (PARTS, bins) the pairs (i of first, j of second) of different owners that are closer than
     edge * bins; fractions of the box, second sorted by cells of the grid, `start` where each begins."""
-    first, owner, second, owner_2, cell, grid, start, reach, edge, counts = opened(parcel)
+    first, owner, second, owner_2, cell, grid, start, reach, edge, counts = load_arguments(task_arguments)
     bins = counts.shape[1]
     largest = (edge * bins) ** 2
     nx, ny, nz = grid
@@ -55,14 +55,9 @@ def heights(cell: np.ndarray) -> np.ndarray:
 
 
 def count_pairs(
-    first: np.ndarray,
-    owner: np.ndarray,
-    second: np.ndarray,
-    owner_2: np.ndarray,
-    cell: np.ndarray,
-    edge: float,
+    first: np.ndarray, owner: np.ndarray, second: np.ndarray, owner_2: np.ndarray, cell: np.ndarray, edge: float,
     bins: int,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Number (bins,) of ordered pairs of sites (k, 3) and (l, 3), Å, of different molecules `owner`, by distance.
 
     cell (3, 3), a along x and b in the plane of x and y; edge * bins is at most half its smallest height.
@@ -74,9 +69,9 @@ def count_pairs(
     inside, inside_2 = ((at @ inverse) % 1.0 for at in (first, second))
     inside[inside == 1.0] = 0.0
     inside_2[inside_2 == 1.0] = 0.0
-    place = np.minimum((inside_2 * grid).astype(int), grid - 1) @ [grid[1] * grid[2], grid[2], 1]
-    order = np.argsort(place, kind="stable")
-    start = np.searchsorted(place[order], np.arange(grid.prod() + 1))
+    cell_of = np.minimum((inside_2 * grid).astype(int), grid - 1) @ [grid[1] * grid[2], grid[2], 1]
+    order = np.argsort(cell_of, kind="stable")
+    start = np.searchsorted(cell_of[order], np.arange(grid.prod() + 1))
     counts = np.zeros((PARTS, bins), np.int64)
     sizes = tuple(map(int, grid)), tuple(map(int, reach))
     content = (inside, owner, inside_2[order], owner_2[order], cell, sizes[0], start, sizes[1], edge, counts)

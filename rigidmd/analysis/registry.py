@@ -1,4 +1,4 @@
-"""The analyses by name: those that come with the package, and those of users."""
+"""The analyses by name, built-in and user-defined."""
 
 import runpy
 from collections.abc import Callable, Mapping
@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.findings import Curve, Finding, Value, settled
-from rigidmd.analysis.history import History
+from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value
+from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.statistics import correlation_time, mean
 from rigidmd.errors import OutputError
@@ -16,12 +16,12 @@ from rigidmd.scene.validation import did_you_mean
 
 
 class Analysis(NamedTuple):
-    """A function of a history under its name."""
+    """A function of frames under its name."""
 
     name: str
     about: str
-    function: Callable[..., Finding]
-    own: bool
+    function: Callable[..., AnalysisResult]
+    is_user: bool
 
 
 KNOWN: dict[str, Analysis] = {}
@@ -31,10 +31,10 @@ ORDER = (
 )  # fmt: skip
 
 
-def built_in(about: str) -> Callable[[Callable[..., Finding]], Callable[..., Finding]]:
-    """Register an analysis that comes with the package under the name of its function."""
+def built_in(about: str) -> Callable[[Callable[..., AnalysisResult]], Callable[..., AnalysisResult]]:
+    """Register a built-in analysis under the name of its function."""
 
-    def add(function: Callable[..., Finding]) -> Callable[..., Finding]:
+    def add(function: Callable[..., AnalysisResult]) -> Callable[..., AnalysisResult]:
         name = function.__name__
         KNOWN[name] = Analysis(name, about, function, False)
         return function
@@ -42,46 +42,46 @@ def built_in(about: str) -> Callable[[Callable[..., Finding]], Callable[..., Fin
     return add
 
 
-def register(function: Callable[[History], Any]) -> Callable[[History], Any]:
-    """Register an analysis of one's own under the name of its function; `rigidmd analyse --only NAME` finds it.
+def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], Any]:
+    """Register a user-defined analysis under the name of its function; `rigidmd analyse --only NAME` runs it.
 
     @rigidmd.analysis.register
     def height(frames):
         "mean height of the centres (Å)"
         return frames.positions[:, :, 2].mean(axis=1)
 
-    The function gets the frames (`rigidmd.analysis.history.History`: time, positions, Q, L, velocities, cell, ...) and
-    returns one number for each frame (f,), or a dictionary of such arrays; means, errors, a CSV file and a figure are
-    made of them. Its first line of documentation is the title. Raises OutputError for a name that is taken.
+    The function gets a `rigidmd.analysis.rigid_frames.RigidFrames` (time, positions, Q, L, velocities, cell, ...) and
+    returns one number for each frame (f,), or a dictionary of such arrays, of which means, errors, a CSV file and a
+    figure are made. The first line of its docstring is the title. Raises OutputError if the name is not free.
     """
     name = getattr(function, "__name__", "")
-    if name in ORDER:  # whether those are registered yet or not
-        raise OutputError(f"{name} is an analysis that comes with rigidmd; name your function otherwise")
+    if name in ORDER:
+        raise OutputError(f"{name} is an analysis of rigidmd; rename your function")
     if not name.isidentifier():
-        raise OutputError(f"an analysis has the name of its function, and {name or function!r} is no name: use def")
+        raise OutputError(f"an analysis has the name of its function; {name or function!r} is not a name: use def")
     about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
-    KNOWN[name] = Analysis(name, about, lambda history: _of_own(name, about, function, history), True)
+    KNOWN[name] = Analysis(name, about, lambda frames: _analyse_by_function(name, about, function, frames), True)
     return function
 
 
 def selected(names: list[str]) -> list[Analysis]:
-    """The analyses of these names, or all. Raises OutputError."""
-    known = sorted(KNOWN, key=place)
+    """The analyses with these names, or all. Raises OutputError."""
+    known = sorted(KNOWN, key=analysis_order)
     for name in names:
         if name not in KNOWN:
             raise OutputError(
-                f"there is no analysis {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
+                f"unknown analysis {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
             )
     return [KNOWN[name] for name in names or known]
 
 
-def place(name: str) -> int:
-    """The place of an analysis among all: those of users at the end."""
+def analysis_order(name: str) -> int:
+    """The position of an analysis among all: user-defined ones at the end."""
     return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
-def trusted(path: Path) -> None:
-    """Run a Python file that defines analyses: it is code, and the user said that it may run. Raises OutputError."""
+def run_user_file(path: Path) -> None:
+    """Run a Python file that defines analyses, which the user trusts. Raises OutputError."""
     if fault := unreadable_reason(path):
         raise OutputError(f"{path}: {fault}")
     before = dict(KNOWN)
@@ -89,42 +89,44 @@ def trusted(path: Path) -> None:
         runpy.run_path(str(path))
     except OutputError as error:
         raise OutputError(f"{path}: {error}") from None
-    except (Exception, SystemExit) as error:  # whatever a stranger's file raises
+    except (Exception, SystemExit) as error:  # a user's file may raise anything
         raise OutputError(f"{path} raised {type(error).__name__}: {error}") from error
-    if not any(entry.own and entry is not before.get(name) for name, entry in KNOWN.items()):
+    if not any(entry.is_user and entry is not before.get(name) for name, entry in KNOWN.items()):
         raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis.register before a function of frames")
 
 
-def _of_own(name: str, about: str, function: Callable[[History], Any], history: History) -> Finding:
-    """Means and errors of what a function of users gives."""
+def _analyse_by_function(
+    name: str, about: str, function: Callable[[RigidFrames], Any], frames: RigidFrames
+) -> AnalysisResult:
+    """Means and errors of the values of a user-defined function."""
     try:
-        found = function(history)
-    except (Exception, SystemExit) as error:  # whatever a stranger's function raises
+        found = function(frames)
+    except (Exception, SystemExit) as error:  # a user's function may raise anything
         raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
     series = dict(found) if isinstance(found, Mapping) else {name: found}
     if not series:
-        raise OutputError(f"the analysis {name} gave an empty dictionary")
+        raise OutputError(f"the analysis {name} returned an empty dictionary")
     values, columns = [], {}
     for title, given in series.items():
         try:
             array = np.asarray(given, float)
         except (TypeError, ValueError):
             array = np.array([])
-        if array.shape != (len(history),):
+        if array.shape != (len(frames),):
             raise OutputError(
-                f"the analysis {name} must give one number for each of the {len(history)} frames, or a dictionary of "
+                f"the analysis {name} must return one number for each of the {len(frames)} frames, or a dictionary of "
                 f"such arrays; {title!r} has the shape {np.shape(given)}"
             )
         if not np.isfinite(array).all():
             raise OutputError(
-                f"the analysis {name}: {title!r} is no finite number at frame {np.isfinite(array).argmin() + 1}"
+                f"the analysis {name}: {title!r} is not a finite number at frame {np.isfinite(array).argmin() + 1}"
             )
         columns[str(title)] = array
         value, error = mean(array)
-        gap = history.span / (len(history) - 1)
+        gap = frames.span / (len(frames) - 1)
         if np.ptp(array) == 0 or value is None:
             values.append(Value(str(title), "", float(array[0]), 0.0))
         else:
             tau = correlation_time(array, gap)
-            values.append(settled(str(title), "", value, error, history.span, tau))
-    return Finding(name, about, values, [Curve(name, ("Time (ps)", history.time), about, columns)])
+            values.append(converged_value(str(title), "", value, error, frames.span, tau))
+    return AnalysisResult(name, about, values, [Curve(name, ("Time (ps)", frames.time), about, columns)])

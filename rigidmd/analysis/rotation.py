@@ -1,4 +1,4 @@
-"""How molecules turn and shake: orientational correlation, rotational diffusion, spectra; from Q, L and V."""
+"""Rotation and spectra: orientational correlation, rotational diffusion, densities of states; from Q, L and V."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,65 +7,73 @@ import numpy as np
 from scipy import signal
 
 from rigidmd.analysis.correlation import correlation, squared_displacement
-from rigidmd.analysis.findings import BLOCKS, LEAST_EACH, Curve, Finding, Value, over_parts, settled, so_far
-from rigidmd.analysis.history import History
 from rigidmd.analysis.registry import built_in
-from rigidmd.analysis.translation import evenly
+from rigidmd.analysis.result import (
+    BLOCKS,
+    MIN_MOLECULAR_TIMES,
+    AnalysisResult,
+    Curve,
+    Value,
+    converged_value,
+    describe_so_far,
+    with_group_error,
+)
+from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.translation import interval_and_lags
 from rigidmd.errors import OutputError
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 
-#: Correlation below which the integral of a correlation function ends; what follows is an exponential.
+#: Correlation at which the integral of a correlation function is continued by an exponential.
 TAIL = 0.05
-#: Correlation at the longest lag above which there is no value: too much of the integral would be that exponential.
+#: Correlation at the longest lag above which the integral has no value: too much of it would be that exponential.
 HIGH = 0.2
-#: And up to which that lag tells when it will have decayed.
+#: Largest correlation at the longest lag from which the decay time is estimated.
 SLOWEST = 0.98
-#: rad: largest turn between two frames, root mean square, at which turns about the body's axes can be added up.
-LARGEST_TURN = 0.7
-#: Correlation of a velocity over one interval of frames below which these are too far apart for a spectrum.
+#: Largest root mean square rotation between two frames, rad, at which rotations about the body's axes can be summed.
+LARGEST_ROTATION = 0.7
+#: Least correlation of a velocity over one interval of frames for a spectrum.
 CLOSE = 0.5
 #: 1/cm in 1/ps.
 PER_CM = 0.0299792458
 
 
-def _turning(history: History) -> list[Kind]:
-    found = [kind for kind in history.moving if kind.molecule.degrees_of_freedom > 3]
+def _rotating_species(frames: RigidFrames) -> list[Kind]:
+    found = [kind for kind in frames.moving if kind.molecule.degrees_of_freedom > 3]
     if not found:
-        raise OutputError("no molecule of this run turns")
+        raise OutputError("no molecule of this run rotates")
     return found
 
 
 def _axes(kind: Kind) -> list[int]:
-    """Body axes whose direction says something: of a linear molecule its own."""
+    """Body axes that are defined: all three, or the axis of a linear molecule."""
     return [0] if rotational_freedom(kind.molecule.kind) == 2 else [0, 1, 2]
 
 
 @built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion")
-def orientation(history: History) -> Finding:
+def orientation(frames: RigidFrames) -> AnalysisResult:
     """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of the body's principal axes u, their correlation times (ps), and the
     rotational diffusion about each axis (1/ps).
 
-    Axes are those of `rigidmd models NAME`, ascending in inertia; of a linear molecule there is one. Rotational
-    diffusion is the slope of the mean squared turn about an axis of the body, sums over the turns between frames.
-    Raises OutputError.
+    Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one. Rotational diffusion is
+    the slope of the mean squared rotation about an axis of the body, summed over frames. Raises OutputError.
     """
-    kinds = _turning(history)
-    interval, lags = evenly(history, "an orientational correlation")
+    kinds = _rotating_species(frames)
+    interval, lags = interval_and_lags(frames, "an orientational correlation")
     time = interval * np.arange(lags)
-    found = Finding("orientation", "orientational correlation")
+    found = AnalysisResult("orientation", "orientational correlation")
     curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0)
     found.curves.append(curve)
     for kind in kinds:
-        if note := _axes_in_words(kind):
+        if note := _describe_axes(kind):
             found.notes.append(note)
         for axis in _axes(kind):
 
-            def seen(part: History, own: Kind, axis=axis) -> np.ndarray:
-                both = _legendre(part, own, axis, lags)
+            def compute(part: RigidFrames, group: Kind, axis=axis) -> np.ndarray:
+                both = _legendre(part, group, axis, lags)
                 return np.concatenate([both, [[_integral(c, interval)] for c in both]], axis=1)
 
-            values, errors = over_parts(history, kind, seen)
+            values, errors = with_group_error(frames, kind, compute)
             for l in (0, 1):  # noqa: E741
                 C, doubt = values[l, :-1], errors[l, :-1]
                 curve.add(f"C{l + 1} {kind.name} axis {axis + 1}", C, doubt)
@@ -74,22 +82,25 @@ def orientation(history: History) -> Finding:
                 if C[-1] > HIGH:
                     # an exponential falls to HIGH at a lag, and a run is 2 BLOCKS times as long as its longest lag
                     need = 2 * BLOCKS * time[-1] * np.log(HIGH) / np.log(min(float(C[-1]), SLOWEST))
-                    told = (
+                    about = "about" if C[-1] < SLOWEST else "more than"
+                    note = (
                         f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a value; it needs "
-                        f"{'about' if C[-1] < SLOWEST else 'more than'} {need:.2g} ps. {so_far(tau, None, 'ps')}"
+                        f"{about} {need:.2g} ps. {describe_so_far(tau, None, 'ps')}"
                     )
-                    found.values.append(Value(name, "ps", None, None, None, told))
+                    found.values.append(Value(name, "ps", None, None, None, note))
                     continue
-                low, told = int(C.argmin()), ""
+                low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
-                    told = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
-                found.values.append(settled(name, "ps", tau, error, history.span, tau, told, LEAST_EACH))
-        found.values += _rotational_diffusion(history, kind, interval, lags)
+                    note = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
+                found.values.append(
+                    converged_value(name, "ps", tau, error, frames.span, tau, note, MIN_MOLECULAR_TIMES)
+                )
+        found.values += _rotational_diffusion(frames, kind, interval, lags)
     return found
 
 
-def _axes_in_words(kind: Kind) -> str:
-    """Which axis of a molecule is its dipole's."""
+def _describe_axes(kind: Kind) -> str:
+    """A note on the axis along the dipole of a molecule."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
     size = float(np.linalg.norm(dipole))
     if kind.molecule.charge or not kind.molecule.has_dipole:
@@ -97,12 +108,12 @@ def _axes_in_words(kind: Kind) -> str:
     along = int(np.abs(dipole).argmax())
     if abs(dipole[along]) < (1 - 1e-6) * size:
         return ""
-    return f"axis {along + 1} of {kind.name} is that of its dipole"
+    return f"axis {along + 1} of {kind.name} is along its dipole"
 
 
-def _legendre(history: History, kind: Kind, axis: int, lags: int) -> np.ndarray:
+def _legendre(frames: RigidFrames, kind: Kind, axis: int, lags: int) -> np.ndarray:
     """C1 and C2 (2, lags) of one axis."""
-    u = history.Q[..., axis][:, kind.index]
+    u = frames.Q[..., axis][:, kind.index]
     first = 3 * correlation(u, lags)
     squares = np.stack([u[..., i] * u[..., i] for i in range(3)], axis=-1)
     mixed = np.stack([u[..., i] * u[..., (i + 1) % 3] for i in range(3)], axis=-1)
@@ -122,9 +133,9 @@ def _integral(values: np.ndarray, interval: float) -> float:
     return body + float(values[end] * decay)
 
 
-def _turns(history: History, kind: Kind) -> np.ndarray:
-    """Turns between frames along the body's axes (f - 1, k, 3), rad."""
-    Q = history.Q[:, kind.index]
+def _rotations(frames: RigidFrames, kind: Kind) -> np.ndarray:
+    """Rotation vectors between frames along the body's axes (f - 1, k, 3), rad."""
+    Q = frames.Q[:, kind.index]
     between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])
     skew = 0.5 * np.stack(
         [between[..., (i + 2) % 3, (i + 1) % 3] - between[..., (i + 1) % 3, (i + 2) % 3] for i in range(3)], axis=-1
@@ -134,92 +145,96 @@ def _turns(history: History, kind: Kind) -> np.ndarray:
     return skew * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 1.0)[..., None]
 
 
-def _rotational_diffusion(history: History, kind: Kind, interval: float, lags: int) -> list[Value]:
+def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags: int) -> list[Value]:
     if len(_axes(kind)) == 1:
         return []
-    turns = _turns(history, kind)
-    rms = float(np.sqrt(np.mean(np.sum(turns**2, axis=-1))))
+    rotations = _rotations(frames, kind)
+    rms = float(np.sqrt(np.mean(np.sum(rotations**2, axis=-1))))
     names = [f"D_rot of {kind.name}, axis {k + 1}" for k in range(3)]
-    if rms > LARGEST_TURN:
-        told = f"molecules turn by {np.degrees(rms):.0f}° between frames, {interval:g} ps apart: write them more often"
-        return [Value(name, "1/ps", None, None, None, told) for name in names]
+    if rms > LARGEST_ROTATION:
+        note = f"molecules rotate by {np.degrees(rms):.0f}° between frames, every {interval:g} ps: write more of them"
+        return [Value(name, "1/ps", None, None, None, note) for name in names]
     first = max(1, lags // 5)
     time = interval * np.arange(first, lags)
     if len(time) < 2:
         return []
 
-    def slopes(part: History, own: Kind) -> np.ndarray:
-        turned = _turns(part, own)
-        path = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(turned, axis=0)])
+    def slopes(part: RigidFrames, group: Kind) -> np.ndarray:
+        rotations = _rotations(part, group)
+        path = np.concatenate([np.zeros_like(rotations[:1]), np.cumsum(rotations, axis=0)])
         seen = np.stack([squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1)
         return (time - time.mean()) @ seen / np.sum((time - time.mean()) ** 2) / 2
 
-    values, errors = over_parts(history, kind, slopes)
+    values, errors = with_group_error(frames, kind, slopes)
     decay = 1 / (2 * max(float(values.mean()), 1e-300))
     return [
-        settled(name, "1/ps", float(D), float(error), history.span, decay, least=LEAST_EACH)
+        converged_value(name, "1/ps", float(D), float(error), frames.span, decay, least=MIN_MOLECULAR_TIMES)
         for name, D, error in zip(names, values, errors, strict=True)
     ]
 
 
 @built_in("spectra and correlations of velocities, angular velocities and angular momenta")
-def spectrum(history: History) -> Finding:
+def spectrum(frames: RigidFrames) -> AnalysisResult:
     """Densities of states (cm) of translation and of rotation about each body axis, from the power of velocities and
     angular velocities, and their correlation functions. The integral over wave numbers is the number of degrees of
-    freedom of a molecule. Needs frames with velocities, few fs apart. Raises OutputError."""
-    if history.velocities is None or history.L is None:
-        raise OutputError("a spectrum needs velocities in the frames: output.trajectory = 'trajectory.trr' keeps them")
-    interval, lags = evenly(history, "a spectrum")
-    size = len(history) // BLOCKS
-    found = Finding("spectrum", "densities of states")
-    wave_numbers = np.fft.rfftfreq(size, interval) / PER_CM
-    power = Curve("spectrum", ("wave number (1/cm)", wave_numbers), "density of states (cm)", {})
+    freedom of a molecule. Needs frames with velocities, every few fs. Raises OutputError."""
+    if frames.velocities is None or frames.L is None:
+        raise OutputError("a spectrum needs velocities in the frames: output.trajectory = 'trajectory.trr' has them")
+    interval, lags = interval_and_lags(frames, "a spectrum")
+    size = len(frames) // BLOCKS
+    found = AnalysisResult("spectrum", "densities of states")
+    wavenumbers = np.fft.rfftfreq(size, interval) / PER_CM
+    power = Curve("spectrum", ("wave number (1/cm)", wavenumbers), "density of states (cm)", {})
     memory = Curve("velocity_correlation", ("Time (ps)", interval * np.arange(lags)), "correlation", {}, level=0.0)
     found.curves += [power, memory]
-    for kind in history.moving:
+    for kind in frames.moving:
         if kind.molecule.degrees_of_freedom > 3:
             title = f"correlation L {kind.name}"
-            memory.add(title, *over_parts(history, kind, lambda part, own: _normalised(_lab_momenta(part, own), lags)))
+            memory.add(
+                title, *with_group_error(frames, kind, lambda part, group: _normalised(_lab_momenta(part, group), lags))
+            )
         for title, (weight, of) in _rates(kind).items():
-            seen, errors = over_parts(history, kind, lambda part, own, of=of: _normalised(of(part, own), lags))
+            seen, errors = with_group_error(frames, kind, lambda part, group, of=of: _normalised(of(part, group), lags))
             if not seen[1] > CLOSE:
                 raise OutputError(
-                    f"frames {interval:g} ps apart are too far from each other for a spectrum: {title} forgets itself "
-                    "between them; output.trajectory_interval_ps = 0.004 suits water"
+                    f"frames every {interval:g} ps are not enough for a spectrum: {title} decays between "
+                    "them; output.trajectory_interval_ps = 0.004 suits water"
                 )
             memory.add(f"correlation {title}", seen, errors)
 
-            def states(part: History, own: Kind, of=of, weight=weight / history.thermal_energy) -> np.ndarray:
-                return _density_of_states(of(part, own), interval, size, weight)
+            def states(part: RigidFrames, group: Kind, of=of, weight=weight / frames.thermal_energy) -> np.ndarray:
+                return _density_of_states(of(part, group), interval, size, weight)
 
-            power.add(title, *over_parts(history, kind, states))
+            power.add(title, *with_group_error(frames, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
-            at, half = float(wave_numbers[top]), float(wave_numbers[1] / 2)
+            at, half = float(wavenumbers[top]), float(wavenumbers[1] / 2)
             found.values.append(Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution"))
-    highest, fine = 1 / (2 * interval * PER_CM), wave_numbers[1]
-    found.notes.append(f"frames {interval:g} ps apart tell wave numbers up to {highest:.4g}/cm, {fine:.2g}/cm apart")
+    highest, fine = 1 / (2 * interval * PER_CM), wavenumbers[1]
+    found.notes.append(
+        f"frames every {interval:g} ps resolve wave numbers up to {highest:.4g}/cm, in steps of {fine:.2g}/cm"
+    )
     return found
 
 
-def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[History, Kind], Any]]]:
-    """The velocities of a species by name: mass or moment of inertia, and a function that makes their series."""
+def _rates(kind: Kind) -> dict[str, tuple[float, Callable[[RigidFrames, Kind], Any]]]:
+    """The velocities of a species by name: mass or moment of inertia, and a function that returns their series."""
     name, moments = kind.name, kind.molecule.inertia.tolist()
-    found: dict[str, Any] = {f"V {name}": (kind.molecule.mass, lambda part, own: part.velocities[:, own.index])}
+    found: dict[str, Any] = {f"V {name}": (kind.molecule.mass, lambda part, group: part.velocities[:, group.index])}
     if kind.molecule.degrees_of_freedom <= 3:
         return found
-    if len(_axes(kind)) == 1:  # which of its two other axes is which has no meaning
-        found[f"omega {name}"] = moments[2], lambda part, own: _lab_momenta(part, own) / moments[2]
+    if len(_axes(kind)) == 1:  # its two other axes are equivalent
+        found[f"omega {name}"] = moments[2], lambda part, group: _lab_momenta(part, group) / moments[2]
     else:
         for k, moment in enumerate(moments):
-            of = lambda part, own, k=k, moment=moment: part.L[:, own.index, k : k + 1] / moment  # noqa: E731
+            of = lambda part, group, k=k, moment=moment: part.L[:, group.index, k : k + 1] / moment  # noqa: E731
             found[f"omega {name} axis {k + 1}"] = moment, of
     return found
 
 
-def _lab_momenta(history: History, kind: Kind) -> np.ndarray:
+def _lab_momenta(frames: RigidFrames, kind: Kind) -> np.ndarray:
     """Angular momenta (f, k, 3) along the axes of the lab."""
-    assert history.L is not None
-    return np.einsum("fnij,fnj->fni", history.Q[:, kind.index], history.L[:, kind.index])
+    assert frames.L is not None
+    return np.einsum("fnij,fnj->fni", frames.Q[:, kind.index], frames.L[:, kind.index])
 
 
 def _normalised(values: np.ndarray, lags: int) -> np.ndarray:

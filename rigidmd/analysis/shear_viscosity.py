@@ -4,81 +4,81 @@ import numpy as np
 from scipy import optimize
 
 from rigidmd.analysis.correlation import correlation
-from rigidmd.analysis.findings import Curve, Finding, Value, settled, so_far
-from rigidmd.analysis.history import EVEN, History
 from rigidmd.analysis.registry import built_in
+from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value, describe_so_far
+from rigidmd.analysis.rigid_frames import EVEN, RigidFrames
 from rigidmd.analysis.translation import MPA_S
 from rigidmd.errors import OutputError
 from rigidmd.units import BAR
 
-#: Stretches that the tensor is cut into, and ps that each must have; the longest time of its correlation, ps.
-STRETCHES, SHORTEST = 10, 2.0
-#: Points that a fit needs, and correlation over one interval below which lines of the tensor are too far apart: the
-#: trapezoidal rule is then 4% too large, if the correlation is an exponential.
+#: Number of segments of the tensor, and the least length of each, ps.
+SEGMENTS, SHORTEST = 10, 2.0
+#: Least points of a fit, and least correlation over one interval of the tensor: below it the trapezoidal rule is more
+#: than 4 % too large, if the correlation is an exponential.
 FEWEST, CLOSE = 8, 0.5
 #: The fit ends where the standard error of the mean integral is this fraction of it. With 0.15 the noise of the tail
 #: makes values 5 to 13% too large (400 ps, correlation times of 0.1 to 0.8 ps); with 0.05 fits of 0.4 ns end too early.
 DOUBT = 0.08
-#: Share of the integral that the second half of the fit may add: what an exponential adds with 2.2 of its times there.
+#: Fraction of the integral that the second half of the fit may add, as an exponential does with 2.2 of its times there.
 GROWS = 0.25
-#: Stretches drawn again, with repetition, for the error of the fit.
+#: Bootstrap samples of the segments for the error of the fit.
 DRAWS = 50
 
 
 @built_in("viscosity from the pressure tensor, by Green and Kubo")
-def viscosity(history: History) -> Finding:
+def viscosity(frames: RigidFrames) -> AnalysisResult:
     """Shear viscosity (mPa s): V/kT times the integral of the correlation of five independent components of the
-    pressure tensor, which output.pressure_tensor_interval_ps keeps.
+    pressure tensor (output.pressure_tensor_interval_ps).
 
-    Integrals of ten stretches are averaged; A a (1 - exp(-t/a)) + B b (1 - exp(-t/b)) is fitted, each point weighted by
+    Integrals of ten segments are averaged; A a (1 - exp(-t/a)) + B b (1 - exp(-t/b)) is fitted, each point weighted by
     its scatter, and its limit is the value (Zhang, Otani & Maginn 2015, J. Chem. Theory Comput. 11, 3537). The error is
-    that of stretches drawn again. Raises OutputError.
+    from a bootstrap of the segments. Raises OutputError.
     """
-    if not history.has_box:
+    if not frames.has_box:
         raise OutputError("a viscosity needs a box")
-    if history.tensor is None or len(history.tensor) < 2:
+    if frames.tensor is None or len(frames.tensor) < 2:
         raise OutputError(
-            "a viscosity needs the pressure tensor: output.pressure_tensor_interval_ps = 0.01 keeps that of water"
+            "a viscosity needs the pressure tensor: output.pressure_tensor_interval_ps = 0.01 suits water"
         )
-    gaps = np.diff(history.tensor[:, 0])
+    gaps = np.diff(frames.tensor[:, 0])
     interval = float(gaps.mean())
     if np.ptp(gaps) > EVEN * gaps.max():
-        raise OutputError("a viscosity needs the pressure tensor at equal times; its lines are not")
-    size = len(history.tensor) // STRETCHES
-    if gaps.sum() + interval < STRETCHES * SHORTEST:
-        need = STRETCHES * SHORTEST
+        raise OutputError("a viscosity needs the pressure tensor at equal intervals")
+    size = len(frames.tensor) // SEGMENTS
+    if gaps.sum() + interval < SEGMENTS * SHORTEST:
+        need = SEGMENTS * SHORTEST
         raise OutputError(
-            f"a viscosity needs {need:g} ps of the pressure tensor at least; there are {gaps.sum():.3g} ps of it"
+            f"a viscosity needs at least {need:g} ps of the pressure tensor; there are {gaps.sum():.3g} ps"
         )
-    xx, yy, zz, xy, xz, yz = (history.tensor[:, k] * BAR for k in range(1, 7))
+    xx, yy, zz, xy, xz, yz = (frames.tensor[:, k] * BAR for k in range(1, 7))
     parts = np.stack([xy, xz, yz, (xx - yy) / 2, (yy - zz) / 2], axis=1)
     lags = size // 2
-    factor = float(history.volume.mean()) / history.thermal_energy / MPA_S
-    stretches = parts[: size * STRETCHES].reshape(STRETCHES, size, 5)
-    seen = np.array([[correlation(one[:, k], max(2, lags)) for k in range(5)] for one in stretches])
+    factor = float(frames.volume.mean()) / frames.thermal_energy / MPA_S
+    segments = parts[: size * SEGMENTS].reshape(SEGMENTS, size, 5)
+    seen = np.array([[correlation(one[:, k], max(2, lags)) for k in range(5)] for one in segments])
     seen = seen.reshape(-1, max(2, lags))
     if lags < FEWEST or seen[:, 1].sum() < CLOSE * seen[:, 0].sum():
         raise OutputError(
-            f"lines of the pressure tensor {interval:.3g} ps apart are too far apart for a viscosity: stresses "
-            "forget themselves between them; output.pressure_tensor_interval_ps = 0.01 suits water"
+            f"an interval of {interval:.3g} ps of the pressure tensor is too long for a viscosity: stresses decay "
+            "in it; output.pressure_tensor_interval_ps = 0.01 suits water"
         )
     running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))
     time = interval * np.arange(lags)
     mean, scatter = running.mean(axis=0), running.std(axis=0, ddof=1)
     wide = np.flatnonzero(scatter[1:] > DOUBT * np.sqrt(len(running)) * np.abs(mean[1:]))
-    settled_from = int(np.argmax(mean > 0.5 * mean.max()))
-    wide = wide[wide > settled_from]
+    half_from = int(np.argmax(mean > 0.5 * mean.max()))
+    wide = wide[wide > half_from]
     end = max(int(wide[0]) + 1 if len(wide) else lags, FEWEST)
     whole = _limit(time[:end], mean[:end], scatter[:end])
     random = np.random.default_rng(0)
-    groups = running.reshape(STRETCHES, 5, lags)
-    drawn = []
+    groups = running.reshape(SEGMENTS, 5, lags)
+    resampled = []
     for _ in range(DRAWS):
-        chosen = groups[random.integers(0, STRETCHES, STRETCHES)].reshape(-1, lags)
+        chosen = groups[random.integers(0, SEGMENTS, SEGMENTS)].reshape(-1, lags)
         again = _limit(time[:end], chosen.mean(axis=0)[:end], scatter[:end])
         if again is not None:
-            drawn.append(again)
-    found = Finding("viscosity", "viscosity")
+            resampled.append(again)
+    found = AnalysisResult("viscosity", "viscosity")
     memory = seen.mean(axis=0) / seen[:, 0].mean()
     axis, title = ("Time (ps)", time[:end]), "integral (mPa s)"
     errors = {title: scatter[:end] / np.sqrt(len(running))}
@@ -87,23 +87,27 @@ def viscosity(history: History) -> Finding:
         Curve("stress_correlation", axis, "correlation of stress", {"correlation": memory[:end]}, level=0.0),
     ]
     grows = float(mean[end - 1] - mean[end // 2]) > GROWS * float(mean[end - 1])
-    if whole is None or grows or len(drawn) < DRAWS // 2:
-        told = (
+    if whole is None or grows or len(resampled) < DRAWS // 2:
+        note = (
             f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps, too short for a value; "
-            f"a run of {4 * gaps.sum():.3g} ps follows it four times as far. "
-            f"{so_far(mean[end - 1], scatter[end - 1] / np.sqrt(len(running)), 'mPa s')}"
+            f"a run of {4 * gaps.sum():.3g} ps is four times as long. "
+            f"{describe_so_far(mean[end - 1], scatter[end - 1] / np.sqrt(len(running)), 'mPa s')}"
         )
-        found.values.append(Value("viscosity", "mPa s", None, None, None, told))
+        found.values.append(Value("viscosity", "mPa s", None, None, None, note))
         return found
-    forgets = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
-    told = f"fitted up to {time[end - 1]:.3g} ps"
-    found.values.append(settled("viscosity", "mPa s", whole, float(np.std(drawn)), float(gaps.sum()), forgets, told))
+    correlation_time = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
+    note = f"fitted up to {time[end - 1]:.3g} ps"
+    found.values.append(
+        converged_value(
+            "viscosity", "mPa s", whole, float(np.std(resampled)), float(gaps.sum()), correlation_time, note
+        )
+    )
     return found
 
 
 def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float | None:
     """Limit of a running integral by a fit of two exponentials; None where the fit fails."""
-    top, longest = float(np.max(values)), float(time[-1]) / 2  # times that were not seen to decay are noise
+    top, longest = float(np.max(values)), float(time[-1]) / 2  # longer times would be fits to noise
     if not top > 0:
         return None
 
@@ -119,9 +123,9 @@ def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float |
     return float(best[0] + best[1])
 
 
-def viscosity_of(history: History) -> Value:
-    """The viscosity of a history (mPa s), or why there is none."""
+def viscosity_of(frames: RigidFrames) -> Value:
+    """The viscosity (mPa s), or a value with a note on why there is none."""
     try:
-        return viscosity(history).value()
+        return viscosity(frames).value()
     except OutputError as error:
         return Value("viscosity", "mPa s", None, None, None, str(error))

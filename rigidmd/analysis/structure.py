@@ -1,66 +1,66 @@
-"""Where molecules are: g(r), structure factor, density profile, hydrogen bonds."""
+"""Structure: g(r), structure factor, density profile, hydrogen bonds."""
 
 from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from rigidmd.analysis.findings import BLOCKS, Curve, Finding, Value, over_blocks
-from rigidmd.analysis.history import History
 from rigidmd.analysis.pair_histogram import count_pairs, heights
 from rigidmd.analysis.registry import built_in
+from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, with_block_error
+from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.core.statistics import correlation_time, error_of_mean, mean
 from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
-#: Molecules in all frames together of which g(r), S(k) and hydrogen bonds are made; more frames say little more.
-ENOUGH, ENOUGH_WAVES = 200_000, 100_000
+#: Molecules in all frames together for g(r) and hydrogen bonds, and for S(k); more frames add little.
+ENOUGH_MOLECULES, ENOUGH_MOLECULES_K = 200_000, 100_000
 FEWEST, MOST = 20, 500  # frames
 #: Å: largest distance and width of bins of g(r), unless others are given.
 LARGEST, WIDTH = 10.0, 0.05
-#: 1/Å: largest wave vector and width of bins of S(k); wave vectors of a bin at most.
-LARGEST_WAVE, WAVE_WIDTH, WAVES = 8.0, 0.1, 24
+#: 1/Å: largest wave vector and width of bins of S(k); most wave vectors of a bin.
+K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
 #: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379, 55).
-BOND, BOND_ANGLE = 3.5, 30.0
-#: Elements that give and take hydrogen bonds.
+BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
+#: Donors and acceptors of hydrogen bonds.
 BONDING = ("N", "O", "F")
 
 
 @built_in("radial distribution functions g(r) of sites of different molecules")
 def rdf(
-    history: History, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
-) -> Finding:
+    frames: RigidFrames, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
+) -> AnalysisResult:
     """g(r) of two sites, elements or species (for centres of mass); without names, of all pairs of elements, in a
     mixture of species.
 
     g counts pairs of different molecules against the number that there are, so that it is 1 far away in a small box
     too. largest, width : Å. Each frame has its own cell. Raises OutputError.
     """
-    if not history.has_box:
-        raise OutputError("g(r) needs a box: without one there is no density to compare with")
-    half = 0.5 * float(min(heights(cell).min() for cell in history.cell))
+    if not frames.has_box:
+        raise OutputError("g(r) needs a box, which defines a density to compare with")
+    half = 0.5 * float(min(heights(cell).min() for cell in frames.cell))
     if largest is None:
         largest = min(half, LARGEST)
     if not 0 < width < largest <= half * (1 + 1e-9):
         raise OutputError(
             f"g(r) up to {largest:g} Å in bins of {width:g} Å is not possible: half the box is {half:.4g} Å"
         )
-    pairs = [(first, second or first)] if first else _pairs(history)
-    thinned = _thinned(history, ENOUGH)
+    pairs = [(first, second or first)] if first else _pairs(frames)
+    thinned = _thinned(frames, ENOUGH_MOLECULES)
     bins = int(largest / width + 1e-9)
     edges = width * np.arange(bins + 1)
     shells = 4 / 3 * np.pi * np.diff(edges**3)
     r = 0.5 * (edges[1:] + edges[:-1])
     curve = Curve("rdf", ("r (A)", r), "g(r)", {}, level=1.0)
-    found = Finding("rdf", "radial distribution functions", curves=[curve])
+    found = AnalysisResult("rdf", "radial distribution functions", curves=[curve])
     for a, b in pairs:
-        if _possible(thinned, a, b) == 0:
-            found.notes.append(f"g(r) of {a} and {b}: there is no pair of different molecules")
+        if _pair_count(thinned, a, b) == 0:
+            found.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
         g = np.array([_g(thinned, k, a, b, width, bins, shells) for k in range(len(thinned))])
         # of the others that each a has, so that two molecules have one neighbour each
-        density = _possible(thinned, a, b) / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
+        density = _pair_count(thinned, a, b) / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
         title = f"g {a}-{b}"
         parts = [part.mean(axis=0) for part in _split(g)]
         curve.columns[title] = g.mean(axis=0)
@@ -70,14 +70,14 @@ def rdf(
             curve.errors[title] = error_of_mean(parts)
         gap = thinned.span / max(1, len(thinned) - 1)
         found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, gap)
-    if len(thinned) < len(history):
-        found.notes.append(f"of {len(thinned)} of {len(history)} frames, evenly spaced")
+    if len(thinned) < len(frames):
+        found.notes.append(f"of {len(thinned)} of {len(frames)} frames, evenly spaced")
     return found
 
 
-def _thinned(history: History, enough: int) -> History:
-    """Evenly spaced frames with about so many molecules in all."""
-    return history.thinned(min(MOST, max(FEWEST, enough // len(history.system.model.species))))
+def _thinned(frames: RigidFrames, enough: int) -> RigidFrames:
+    """Evenly spaced frames with about `enough` molecules in total."""
+    return frames.thinned(min(MOST, max(FEWEST, enough // len(frames.system.model.species))))
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:
@@ -85,47 +85,46 @@ def _split(values: np.ndarray) -> list[np.ndarray]:
     return list(np.array_split(values, BLOCKS)) if len(values) >= 2 * BLOCKS else []
 
 
-def _pairs(history: History) -> list[tuple[str, str]]:
-    """Pairs of names that g(r) is made of by itself: elements of a pure liquid, species of a mixture."""
-    names = [kind.name for kind in history.kinds]
+def _pairs(frames: RigidFrames) -> list[tuple[str, str]]:
+    """Default pairs of names: elements of a pure liquid, species of a mixture."""
+    names = [kind.name for kind in frames.kinds]
     if len(set(names)) == 1:
-        m = history.kinds[0].molecule
+        m = frames.kinds[0].molecule
         elements = dict.fromkeys(e for e, mass in zip(m.elements, m.masses, strict=True) if mass > 0 and e != "X")
         names = list(elements) or names
     names = list(dict.fromkeys(names))
     return list(combinations_with_replacement(names, 2))
 
 
-def _possible(history: History, a: str, b: str) -> int:
+def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
     """Number of ordered pairs of a and b in different molecules."""
-    (_, first), (_, second) = history.sites(a, slice(0, 1)), history.sites(b, slice(0, 1))
-    number = len(history.system.model.species)
-    own = np.bincount(first, minlength=number) @ np.bincount(second, minlength=number)
-    return len(first) * len(second) - int(own)
+    (_, first), (_, second) = frames.sites(a, slice(0, 1)), frames.sites(b, slice(0, 1))
+    number = len(frames.system.model.species)
+    same = np.bincount(first, minlength=number) @ np.bincount(second, minlength=number)
+    return len(first) * len(second) - int(same)
 
 
-def _g(history: History, frame: int, a: str, b: str, width: float, bins: int, shells: np.ndarray) -> np.ndarray:
+def _g(frames: RigidFrames, frame: int, a: str, b: str, width: float, bins: int, shells: np.ndarray) -> np.ndarray:
     """g(r) of one frame (bins,)."""
-    at, owner = history.sites(a, slice(frame, frame + 1))
-    at_2, owner_2 = (at, owner) if a == b else history.sites(b, slice(frame, frame + 1))
-    counts = count_pairs(at[0], owner, at_2[0], owner_2, history.cell[frame], width, bins)
-    return counts * float(history.volume[frame]) / (_possible(history, a, b) * shells)
+    at, owner = frames.sites(a, slice(frame, frame + 1))
+    at_2, owner_2 = (at, owner) if a == b else frames.sites(b, slice(frame, frame + 1))
+    counts = count_pairs(at[0], owner, at_2[0], owner_2, frames.cell[frame], width, bins)
+    return counts * float(frames.volume[frame]) / (_pair_count(frames, a, b) * shells)
 
 
 def _peaks(
     name: str, r: np.ndarray, frames: np.ndarray, parts: list[np.ndarray], filled: np.ndarray, gap: float
 ) -> list[Value]:
-    """Place and height of the first peak, and neighbours up to the first minimum, if there is a peak.
+    """Position and height of the first peak, and neighbours up to the first minimum, if there is a peak.
 
-    frames (f, bins) : g(r) of each, `gap` ps apart; parts : means of blocks; filled (bins,) : neighbours where g is 1
+    frames (f, bins) : g(r) of each, every `gap` ps; parts : means of blocks; filled (bins,) : neighbours where g is 1
     """
 
     width = r[1] - r[0]
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
 
     def valley(g: np.ndarray, top: int) -> float:
-        """Place of the first minimum after a peak: that of a cubic through its surroundings, which noise of single
-        bins moves little."""
+        """Position of the first minimum after a peak, from a fit of a cubic, as single bins are noisy."""
         low = top + int(np.argmin(g[top : top + max(3, int(0.9 * top))]))
         reach = max(2, (low - top) // 3)
         near = slice(max(top, low - reach), low + reach + 1)
@@ -136,15 +135,15 @@ def _peaks(
 
     def within(g: np.ndarray, end: float) -> np.ndarray:
         """Neighbours up to a distance, of g (..., bins)."""
-        share = np.clip((end - edges[:-1]) / width, 0.0, 1.0)  # of each bin
-        return (g * filled) @ share
+        fraction = np.clip((end - edges[:-1]) / width, 0.0, 1.0)  # of each bin
+        return (g * filled) @ fraction
 
     def seen(g: np.ndarray, top: int) -> np.ndarray:
         low, middle, high = g[top - 1 : top + 2]
         bend = low - 2 * middle + high
         shift = 0.5 * (low - high) / bend if bend < 0 else 0.0
-        place, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
-        return np.array([place, height, within(g, valley(g, top))])
+        position, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
+        return np.array([position, height, within(g, valley(g, top))])
 
     g = frames.mean(axis=0)
     top = _first_top(g)
@@ -157,8 +156,8 @@ def _peaks(
     inside = within(frames, valley(g, top))
     tau = correlation_time(inside, gap) if len(frames) > 2 else None
     if len(usable) > 1:
-        place, height, neighbours = error_of_mean(usable)
-        errors = [place, height, max(neighbours, mean(inside)[1] or 0.0)]
+        position, height, neighbours = error_of_mean(usable)
+        errors = [position, height, max(neighbours, mean(inside)[1] or 0.0)]
     titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
@@ -182,50 +181,50 @@ def _first_top(g: np.ndarray) -> int:
 
 
 @built_in("structure factor S(k) of the centres of mass")
-def structure_factor(history: History, name: str = "", largest: float = LARGEST_WAVE) -> Finding:
-    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box; without a name of the
+def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX) -> AnalysisResult:
+    """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box; without a name, of the
     centres of all molecules. largest : 1/Å. Raises OutputError."""
-    if not history.has_box:
+    if not frames.has_box:
         raise OutputError("a structure factor needs a box")
-    thinned = _thinned(history, ENOUGH_WAVES)
+    thinned = _thinned(frames, ENOUGH_MOLECULES_K)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
         raise OutputError(
             f"this box has no wave vector shorter than {largest:g} 1/Å; the shortest is {shortest:.3g} 1/Å"
         )
-    waves, bin_of = _waves(reciprocal, largest)
+    vectors, bin_of = _k_vectors(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
     values = np.empty((len(thinned), len(used)))
     for k in range(len(thinned)):
         at = thinned.positions[k] if not name else thinned.sites(name, slice(k, k + 1))[0][0]
-        phases = (at @ np.linalg.inv(thinned.cell[k])) @ (2 * np.pi * waves.T)
+        phases = (at @ np.linalg.inv(thinned.cell[k])) @ (2 * np.pi * vectors.T)
         size = np.cos(phases).sum(axis=0) ** 2 + np.sin(phases).sum(axis=0) ** 2
         values[k] = np.bincount(members, size) / np.bincount(members) / len(at)
-    length = np.bincount(members, np.linalg.norm(waves @ reciprocal, axis=1)) / np.bincount(members)
+    length = np.bincount(members, np.linalg.norm(vectors @ reciprocal, axis=1)) / np.bincount(members)
     title = f"S {name or 'centres'}"
     curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: values.mean(axis=0)}, level=1.0)
     parts = [part.mean(axis=0) for part in _split(values)]
-    found = Finding("structure_factor", "structure factor", curves=[curve])
+    found = AnalysisResult("structure_factor", "structure factor", curves=[curve])
     if len(parts) > 1:
         curve.errors[title] = error_of_mean(parts)
         top = int(np.argmax(curve.columns[title]))
         height, error = float(curve.columns[title][top]), float(curve.errors[title][top])
-        told = f"at {length[top]:.2f} 1/Å, bins of {WAVE_WIDTH} 1/Å"
+        note = f"at {length[top]:.2f} 1/Å, bins of {K_WIDTH} 1/Å"
         tau = correlation_time(values[:, top], thinned.span / (len(thinned) - 1))
-        found.values.append(Value("highest peak of S(k)", "1", height, error, tau, told))
-    if len(thinned) < len(history):
+        found.values.append(Value("highest peak of S(k)", "1", height, error, tau, note))
+    if len(thinned) < len(frames):
         found.notes.append(
-            f"of {len(thinned)} of {len(history)} frames, and up to {WAVES} wave vectors in each of {bins} bins"
+            f"of {len(thinned)} of {len(frames)} frames, and at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
         )
     return found
 
 
-def _waves(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Integer wave vectors (w, 3), one of k and -k, and the bin of each; few of each bin, chosen evenly."""
+def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Integer wave vectors (w, 3), one of k and -k, and the bin of each; evenly chosen in bins with many."""
     reach = np.ceil(largest / heights(reciprocal)).astype(int)
-    found, place = [], []
+    found, bin_index = [], []
     for h in range(reach[0] + 1):
         rest = np.array(list(product([h], range(-reach[1], reach[1] + 1), range(-reach[2], reach[2] + 1))))
         if h == 0:
@@ -233,29 +232,29 @@ def _waves(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarr
         size = np.linalg.norm(rest @ reciprocal, axis=1)
         near = size < largest
         found.append(rest[near])
-        place.append((size[near] / WAVE_WIDTH).astype(int))
-    waves, bin_of = np.concatenate(found), np.concatenate(place)
+        bin_index.append((size[near] / K_WIDTH).astype(int))
+    vectors, bin_of = np.concatenate(found), np.concatenate(bin_index)
     kept = []
     for k in np.unique(bin_of):
-        own = np.flatnonzero(bin_of == k)
-        kept.append(own[np.unique(np.linspace(0, len(own) - 1, WAVES).astype(int))])
+        of_bin = np.flatnonzero(bin_of == k)
+        kept.append(of_bin[np.unique(np.linspace(0, len(of_bin) - 1, VECTORS_PER_BIN).astype(int))])
     chosen = np.concatenate(kept)
-    return waves[chosen], bin_of[chosen]
+    return vectors[chosen], bin_of[chosen]
 
 
 @built_in("profile of the density along an axis of the box")
-def density_profile(history: History, axis: str = "z", bins: int = 100) -> Finding:
+def density_profile(frames: RigidFrames, axis: str = "z", bins: int = 100) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c. Raises OutputError."""
     if axis not in ("x", "y", "z"):
-        raise OutputError(f"there is no axis {axis!r}; name x, y or z (the edges a, b and c of the box)")
-    if not history.has_box:
+        raise OutputError(f"unknown axis {axis!r}; name x, y or z (the edges a, b and c of the box)")
+    if not frames.has_box:
         raise OutputError("a profile of the density needs a box")
     if bins < 1:
-        raise OutputError(f"a profile needs at least one of its bins, not {bins}")
+        raise OutputError(f"a profile needs at least one bin, not {bins}")
     k = "xyz".index(axis)
-    height = float(np.mean([heights(cell)[k] for cell in history.cell]))
+    height = float(np.mean([heights(cell)[k] for cell in frames.cell]))
 
-    def profile(part: History, kind: Kind) -> np.ndarray:
+    def profile(part: RigidFrames, kind: Kind) -> np.ndarray:
         across, total = np.linalg.inv(part.cell)[:, :, k], np.zeros(bins)
         for site, mass in enumerate(kind.molecule.masses):
             at = part.positions[:, kind.index]
@@ -267,42 +266,42 @@ def density_profile(history: History, axis: str = "z", bins: int = 100) -> Findi
 
     at = (np.arange(bins) + 0.5) * height / bins
     curve = Curve("density_profile", (f"{axis} (A)", at), "density (g/cm³)", {})
-    for kind in history.kinds:
-        values, errors = over_blocks(history, lambda part, kind=kind: profile(part, kind))
+    for kind in frames.kinds:
+        values, errors = with_block_error(frames, lambda part, kind=kind: profile(part, kind))
         title = f"density {kind.name} (g/cm3)"
         curve.columns[title], curve.errors[title] = curve.columns.get(title, 0.0) + values, errors
-    return Finding("density_profile", f"density along {axis}", curves=[curve])
+    return AnalysisResult("density_profile", f"density along {axis}", curves=[curve])
 
 
 @built_in("hydrogen bonds for each molecule, by distances and angles")
-def hydrogen_bonds(history: History, distance: float = BOND, angle: float = BOND_ANGLE) -> Finding:
-    """Mean number of hydrogen bonds of a molecule, given and taken: the heavy sites (N, O, F) closer than `distance`
-    (Å), and the angle between them and the bond to the hydrogen below `angle` (degrees). Raises OutputError."""
-    if not any(_donors(kind.molecule) for kind in history.kinds):
+def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE) -> AnalysisResult:
+    """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F) closer than `distance`
+    (Å), with an angle to the bond of the hydrogen below `angle` (degrees). Raises OutputError."""
+    if not any(_donors(kind.molecule) for kind in frames.kinds):
         raise OutputError(
-            "no molecule has a hydrogen beside a nitrogen, oxygen or fluorine: there are no hydrogen bonds"
+            "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine: there are no hydrogen bonds"
         )
     from rigidmd.io.trajectory import near_pairs
 
-    thinned = _thinned(history, ENOUGH)
-    number = len(history.system.model.species)
+    thinned = _thinned(frames, ENOUGH_MOLECULES)
+    number = len(frames.system.model.species)
     bonds = np.array([_bonds(thinned, k, distance, angle, near_pairs) for k in range(len(thinned))])  # (f, n)
     each = bonds.mean(axis=1)
     value, error = mean(each)
     most = int(bonds.max()) + 1
-    share = np.array([np.mean(bonds == k) for k in range(most)])
+    fraction = np.array([np.mean(bonds == k) for k in range(most)])
     curve = Curve(
-        "hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "share of molecules", {"share": share}, bars=True
+        "hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "fraction of molecules", {"share": fraction}, bars=True
     )
-    told = [f"of {len(thinned)} of {len(history)} frames"] if len(thinned) < len(history) else []
+    note = [f"of {len(thinned)} of {len(frames)} frames"] if len(thinned) < len(frames) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time(each, thinned.span / (len(thinned) - 1))
     found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
-    return Finding("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], told)
+    return AnalysisResult("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], note)
 
 
 def _donors(molecule: Molecule) -> list[tuple[int, int]]:
-    """(heavy site, hydrogen) of the bonds that give hydrogen bonds."""
+    """(heavy site, hydrogen) of the donors of a molecule."""
     heavy = [k for k, element in enumerate(molecule.elements) if element in BONDING]
     found = []
     for h, element in enumerate(molecule.elements):
@@ -315,35 +314,35 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
     return found
 
 
-def _bonds(history: History, frame: int, distance: float, angle: float, near_pairs) -> np.ndarray:
+def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float, near_pairs) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
     heavy, owner, giver, arm = [], [], [], []
     at_frame = slice(frame, frame + 1)
     offset = 0
-    for kind in history.kinds:
-        centre = history.positions[at_frame][0, kind.index]
-        turn = history.Q[frame, kind.index] if history.Q.shape[1] else np.eye(3)[None]
+    for kind in frames.kinds:
+        centre = frames.positions[at_frame][0, kind.index]
+        rotation = frames.Q[frame, kind.index] if frames.Q.shape[1] else np.eye(3)[None]
         sites = [k for k, element in enumerate(kind.molecule.elements) if element in BONDING]
         body = kind.molecule.positions_body
         for site in sites:
-            heavy.append(centre + turn @ body[site])
+            heavy.append(centre + rotation @ body[site])
             owner.append(kind.index)
-            for own, hydrogen in _donors(kind.molecule):
-                if own == site:
+            for donor, hydrogen in _donors(kind.molecule):
+                if donor == site:
                     giver.append(offset + np.arange(len(kind.index)))
-                    arm.append(np.broadcast_to(turn @ (body[hydrogen] - body[site]), centre.shape))
+                    arm.append(np.broadcast_to(rotation @ (body[hydrogen] - body[site]), centre.shape))
             offset += len(kind.index)
     at, who = np.concatenate(heavy), np.concatenate(owner)
     givers, arms = np.concatenate(giver), np.concatenate(arm)
-    pairs, gaps = near_pairs(at, history.cell[frame] if history.has_box else None, distance)
+    pairs, gaps = near_pairs(at, frames.cell[frame] if frames.has_box else None, distance)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     way = np.concatenate([gaps, -gaps])  # from the first to the second
-    apart = who[both[:, 0]] != who[both[:, 1]]
-    both, way = both[apart], way[apart]
+    different = who[both[:, 0]] != who[both[:, 1]]
+    both, way = both[different], way[different]
     order = np.argsort(givers, kind="stable")
     begin = np.searchsorted(givers[order], np.arange(len(at)))
     end = np.searchsorted(givers[order], np.arange(len(at)), side="right")
-    counts = np.zeros(len(history.system.model.species))
+    counts = np.zeros(len(frames.system.model.species))
     for k in range(int((end - begin).max())):
         here = begin[both[:, 0]] + k < end[both[:, 0]]
         pair, gap = both[here], way[here]

@@ -52,7 +52,7 @@ def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     if not isinstance(wanted, int | np.integer):
         raise ValueError(f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'")
     if not -count <= wanted < count:
-        raise IndexError(f"there is no frame {wanted}: this run has {count}")
+        raise IndexError(f"frame {wanted} is out of range: this run has {count}")
     return [int(wanted) % count]
 
 

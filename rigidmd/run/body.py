@@ -115,13 +115,13 @@ class BodySimulation(Simulation):
         return self._resume_data.to_json(scene=plain(self.scene), notes=self.notes)
 
     def _restore(self, kept: Checkpoint) -> None:
-        self._resume_data = read_as(BodyResumeData, kept.told["run"])
+        self._resume_data = read_as(BodyResumeData, kept.values["run"])
         self._warnings.extend(self._resume_data.notes)
         self._segments = self._equal_step_segments()
         arrays, method = kept.of("state").arrays, self.system.method
         check_same_scene(self.scene, self._resume_data.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
-        k = kept.told["place"]["stretch"]
+        k = kept.values["place"]["stretch"]
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)

@@ -67,7 +67,7 @@ class BodyWatch(Observer):
         return Checkpoint({"moved": self.check.exchanged}, {})
 
     def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        least, self.check.exchanged = self.check.exchanged, float(kept.told["moved"])
+        least, self.check.exchanged = self.check.exchanged, float(kept.values["moved"])
         if not least <= self.check.exchanged < inf:
             raise ValueError(f"it has exchanged an energy of {self.check.exchanged:g} J")
         if problem := self.check.failed_check(run.state, run.scene.run.timestep_s):

@@ -239,7 +239,7 @@ class MolecularSimulation(Simulation):
         return self._resume_data.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
 
     def _restore(self, kept: Checkpoint) -> None:
-        data = self._resume_data = read_as(MolecularResumeData, kept.told["run"])
+        data = self._resume_data = read_as(MolecularResumeData, kept.values["run"])
         before = data.scene["stages"]
         # integrators that were chosen stand in the scene of the folder
         decided = [
@@ -252,7 +252,7 @@ class MolecularSimulation(Simulation):
             if k not in data.choices and plain(chosen) != then:
                 raise ValueError(f"its stages.{k} differs from its scene")
         known = (*data.choices, *data.stable, *data.moves, *data.minima)
-        if data.stage != kept.told["place"]["stretch"] or any(k > data.stage for k in known):
+        if data.stage != kept.values["place"]["stretch"] or any(k > data.stage for k in known):
             raise ValueError(f"it has data of later stages than {data.stage}, or is of another stage")
         stages = list(data.stages)
         stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})

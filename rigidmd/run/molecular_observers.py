@@ -38,7 +38,7 @@ class LogFile(GrowingFile):
         self._file = Log(run.path(LOG), self._tensor, user_terms=tuple(run.system.user_terms))
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        self._file = Log(run.path(LOG), self._tensor, count_list(kept.told["kept"]), tuple(run.system.user_terms))
+        self._file = Log(run.path(LOG), self._tensor, count_list(kept.values["kept"]), tuple(run.system.user_terms))
 
     def see(self, moment: Moment) -> None:
         self._file.write(moment.sample)
@@ -64,7 +64,7 @@ class PressureTensor(GrowingFile):
         self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE))
 
     def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        self._file = TensorFile(run.path(TENSOR_FILE), count_list(kept.told["kept"]))
+        self._file = TensorFile(run.path(TENSOR_FILE), count_list(kept.values["kept"]))
 
     def see(self, moment: Moment) -> None:
         row = tensor_row(moment.time, moment.observation.pressure_tensor_bar)

@@ -210,7 +210,7 @@ class Frames(GrowingFile):
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         time, now = kept.arrays["time"], run.state.time[NOW]
-        *_, frames = counts = count_list(kept.told["kept"])
+        *_, frames = counts = count_list(kept.values["kept"])
         if time.shape != (frames,) or not ((time >= 0) & (time <= now)).all() or not (np.diff(time) >= 0).all():
             raise ValueError("the times of its frames are not those of a run")
         self._run, self._frames = run, [Frame(time) for time in time.tolist()]

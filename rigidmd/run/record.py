@@ -158,7 +158,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
         kept, _ = latest(folder)
     except CheckpointError:
         return {}
-    for owner in kept.told.get("of", {}):
+    for owner in kept.values.get("of", {}):
         part = kept.of(owner).arrays
         if "t" in part and set(STORED_NAMES) <= set(part):
             states = zip(*(part[name] for name in STORED_NAMES), strict=True)

@@ -47,7 +47,7 @@ class Results(Displayed):
     out_of_time: bool = False
     _frames: "list[Frame]" = field(default_factory=list)
     _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
-    _histories: dict[float | None, Any] = field(default_factory=dict)  # kept by rigidmd.analysis, by their start
+    _analysis_frames: dict[float | None, Any] = field(default_factory=dict)  # kept by rigidmd.analysis, by their start
 
     def __repr__(self) -> str:
         name = self.system.scene.name

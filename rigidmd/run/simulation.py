@@ -36,7 +36,7 @@ from rigidmd.io.folder import (
     make_folder,
     never_began,
 )
-from rigidmd.io.progress import Spot, announce, is_shown, progress_of
+from rigidmd.io.progress import DisplayArea, announce, is_shown, progress_of
 from rigidmd.run.checkpoints import SEGMENT_SECONDS, CheckpointSchedule, checked_walltime
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
@@ -150,7 +150,7 @@ class Simulation(Displayed, Base):
             )
         self._user_say = say
         self._progress: bool | None = None
-        self._spot = Spot()
+        self._spot = DisplayArea()
         self._warn = warn
         self._warnings: list[str] = []
         self._issued: list[str] = []  # by this process
@@ -192,7 +192,7 @@ class Simulation(Displayed, Base):
             raise RuntimeError("this simulation is running already; its observers cannot run it again")
         with contextlib.ExitStack() as stack:
             kept, stays = None, False
-            self._progress, self._spot, self._process = progress, Spot(), os.getpid()
+            self._progress, self._spot, self._process = progress, DisplayArea(), os.getpid()
             stack.callback(setattr, self, "_process", None)
             if self.folder is not None:
                 stack.callback(self._if_not_forked, (lock := FolderLock(self.folder)).release)
@@ -217,7 +217,7 @@ class Simulation(Displayed, Base):
                 with as_checkpoint_errors(self.folder):
                     self._restore(kept)
                     position = self._checked_position(kept)
-                    changed = describe_changes(kept.told["with"])
+                    changed = describe_changes(kept.values["with"])
             named = _observers_by_name(self._default_observers(), self._observers)
             observers = list(named.values())
             names = [name for observer in observers for name in observer.files()]
@@ -236,7 +236,7 @@ class Simulation(Displayed, Base):
             if kept is not None:  # all checks come before the first change of a file
                 with as_checkpoint_errors(self.folder):
                     for name, observer in named.items():
-                        if name.startswith(USER) and name not in kept.told["of"]:
+                        if name.startswith(USER) and name not in kept.values["of"]:
                             observer.begin(self)
                         else:
                             observer.resume(self, kept.of(name))
@@ -354,7 +354,7 @@ class Simulation(Displayed, Base):
 
     def _checked_position(self, kept: Checkpoint) -> RunPosition:
         """The position of a checkpoint, compared with the scene and the state. Raises ValueError."""
-        position, state = RunPosition.from_json(kept.told["place"]), self.state
+        position, state = RunPosition.from_json(kept.values["place"]), self.state
         if position.segment >= len(self._durations()) or len(position.computing) != position.segment:
             raise ValueError(f"it is of stage {position.segment} of {len(self._durations())}")
         first, time = 0, 0.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidmd.engines.system import Sites, System
 from rigidmd.errors import OutputError
-from rigidmd.io.connections import connections
+from rigidmd.io.bonds import connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
 from rigidmd.view.film_page import data_part, own, packed, script, stage
@@ -42,7 +42,7 @@ def frames_of(record: Record, most: int) -> Frames:
         raise OutputError(f"{record.folder}: this run wrote no trajectory (output.trajectory = false)")
     path = record.folder / output.trajectory
     if not path.is_file():
-        raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is not there")
+        raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is missing")
     found = read_frames(path, len(sites.molecule), most)
     _check_shapes(path, sites, found.positions[0])
     return inside(found, sites)

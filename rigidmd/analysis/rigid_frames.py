@@ -1,4 +1,4 @@
-"""What the molecules of a run did: their frames as rigid bodies, rebuilt from the positions and velocities of sites."""
+"""Frames of a run as rigid bodies, fitted to the positions and velocities of sites: the input of all analyses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
-from rigidmd.run.rigid_fit import Bodies, Kind, Rebuilt, kinds_of
+from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import did_you_mean
@@ -17,21 +17,20 @@ from rigidmd.units import BOLTZMANN
 #: Two intervals between frames that differ by less than this fraction are equal.
 EVEN = 1e-3
 #: Largest fraction of the box that a wrapped molecule may move between two frames to be followed.
-FAR = 0.4
+MAX_WRAPPED_MOVE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class History:
-    """Frames of a stretch of a run, for analyses. Molecules are whole and their paths continuous.
+class RigidFrames:
+    """Frames of a part of a run, for analyses. Molecules are whole and their paths continuous.
 
     f frames, n molecules; Å, ps, u:
     time (f,), cell (f, 3, 3) rows a, b, c, infinite edges without a box
     positions (f, n, 3) centres of mass, lab frame; Q (f, n, 3, 3) body to lab, principal axes
     velocities (f, n, 3) lab frame, L (f, n, 3) angular momentum along the body's axes; None where no frame has them
-    columns : samples of the same stretch by their names in `results[...]`
-    tensor : (l, 7) lines of pressure_tensor.csv, ps and bar, of the same stretch; None where the run kept none
-    interval : time between frames, ps; None if they are not evenly spaced
-    notes : what was mended
+    columns : samples of the same time by their names in `results[...]`
+    tensor : (l, 7) rows of pressure_tensor.csv, ps and bar, of the same time; None if the run wrote none
+    notes : on the choice and the correction of frames
     """
 
     system: System
@@ -50,7 +49,7 @@ class History:
         return len(self.time)
 
     def __repr__(self) -> str:
-        return f"<History: {len(self)} frames over {self.span:g} ps>"
+        return f"<RigidFrames: {len(self)} frames over {self.span:g} ps>"
 
     @property
     def span(self) -> float:
@@ -87,17 +86,17 @@ class History:
 
     @cached_property
     def kinds(self) -> list[Kind]:
-        """The species, frozen ones apart, that have molecules."""
+        """The molecules by species, frozen and mobile ones separately."""
         return kinds_of(self.system)
 
     @property
     def moving(self) -> list[Kind]:
-        """Those that move."""
+        """The mobile molecules by species."""
         return [kind for kind in self.kinds if kind.moves]
 
     @cached_property
     def paths(self) -> np.ndarray:
-        """Paths of centres (f, n, 3), Å, without what a barostat scaled: sums of displacements as fractions of the
+        """Paths of centres (f, n, 3), Å, without the scaling by a barostat: sums of displacements as fractions of the
         cell, each times the cell at its end."""
         if not self.has_box or np.ptp(self.cell, axis=0).max() == 0.0:
             return self.positions
@@ -106,14 +105,14 @@ class History:
         return np.concatenate([self.positions[:1], self.positions[0] + np.cumsum(moves, axis=0)])
 
     def sites(self, name: str, frames: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (f, k, 3) of what is called `name`, and the molecules (k,) that they belong to.
+        """Positions (f, k, 3) of the sites called `name`, and the indices (k,) of their molecules.
 
         name : a site's name (HW1, or HW for HW1 and HW2) or element, or a species for its centres of mass. Raises
         OutputError.
         """
         at, molecules = [], []
         for kind in self.kinds:
-            chosen = np.array(chosen_sites(kind.molecule, name), int)
+            chosen = np.array(sites_named(kind.molecule, name), int)
             centre = self.positions[frames][:, kind.index]
             if kind.name == name:
                 at.append(centre)
@@ -126,21 +125,19 @@ class History:
                 at.append((centre[:, :, None] + arms).reshape(len(centre), -1, 3))
                 molecules.append(np.repeat(kind.index, len(chosen)))
         if not at:
-            known = names_of(self.system)
-            raise OutputError(
-                f"there is no site {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
-            )
+            known = known_names(self.system)
+            raise OutputError(f"unknown site {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}")
         return np.concatenate(at, axis=1), np.concatenate(molecules)
 
-    def part(self, first: int, end: int) -> "History":
-        """Some of its frames, as a history. The samples stay those of the whole."""
+    def part(self, first: int, end: int) -> "RigidFrames":
+        """The frames from `first` to `end`, with all samples."""
         return self._of(slice(first, end))
 
-    def thinned(self, most: int) -> "History":
-        """At most so many of its frames, evenly spaced."""
+    def thinned(self, most: int) -> "RigidFrames":
+        """At most `most` of the frames, evenly spaced."""
         return self._of(slice(None, None, max(1, -(-len(self) // most))))
 
-    def _of(self, frames: slice) -> "History":
+    def _of(self, frames: slice) -> "RigidFrames":
         return replace(
             self,
             time=self.time[frames],
@@ -152,37 +149,37 @@ class History:
         )
 
 
-def chosen_sites(molecule: Molecule, name: str) -> list[int]:
-    """Sites of a molecule with this name, or else with it but for a number at the end, or else of this element."""
-    found = [k for k, own in enumerate(molecule.site_names) if own == name]
-    found = found or [k for k, own in enumerate(molecule.site_names) if own.rstrip("0123456789") == name]
-    return found or [k for k, own in enumerate(molecule.elements) if own == name and name != "X"]
+def sites_named(molecule: Molecule, name: str) -> list[int]:
+    """Sites of a molecule with this name, or else with this name before a number, or else of this element."""
+    found = [k for k, site in enumerate(molecule.site_names) if site == name]
+    found = found or [k for k, site in enumerate(molecule.site_names) if site.rstrip("0123456789") == name]
+    return found or [k for k, element in enumerate(molecule.elements) if element == name and name != "X"]
 
 
-def names_of(system: System) -> list[str]:
-    """What `History.sites` knows: names of sites, then species."""
+def known_names(system: System) -> list[str]:
+    """The names that `RigidFrames.sites` accepts: of sites, then of species."""
     known = dict.fromkeys(name for m in system.species for name in m.site_names)
     return list(known | dict.fromkeys(m.name for m in system.species))
 
 
-def rebuilt(
+def fit_frames(
     system: System,
     sites: np.ndarray,
     velocities: np.ndarray | None,
     cells: np.ndarray,
     wrapped: bool,
-    step: Callable[[float], object] = lambda share: None,
+    progress: Callable[[float], object] = lambda fraction: None,
 ) -> tuple[Bodies, list[str]]:
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
     sites (f, s, 3); velocities alike or None; cells (f, 3, 3)
-    wrapped : whether centres were put into the box; their paths are made continuous
-    step : called with the share that is done
+    wrapped : whether centres are wrapped into the box; their paths are made continuous
+    progress : called with the fraction done
     """
-    fit, n, f = Rebuilt(system), len(system.model.species), len(sites)
-    turning = n if len(system.state.rotation) else 0
-    position, Q = np.empty((f, n, 3)), np.empty((f, turning, 3, 3))
-    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, turning, 3)))
+    fit, n, f = RigidFit(system), len(system.model.species), len(sites)
+    rotating = n if len(system.state.rotation) else 0
+    position, Q = np.empty((f, n, 3)), np.empty((f, rotating, 3, 3))
+    velocity, L = (None, None) if velocities is None else (np.empty((f, n, 3)), np.empty((f, rotating, 3)))
     for k, frame in enumerate(sites):
         try:
             found = fit.bodies(frame, None if velocities is None else velocities[k])
@@ -191,18 +188,18 @@ def rebuilt(
         for array, values in zip((position, Q, velocity, L), found, strict=True):
             if array is not None:
                 array[k] = values
-        step((k + 1) / f)
+        progress((k + 1) / f)
     notes = []
     if wrapped and np.isfinite(cells[0, 0, 0]) and f > 1:
         inside = np.einsum("fni,fij->fnj", position, np.linalg.inv(cells))
         moves = np.diff(inside, axis=0)
         moves -= np.round(moves)
-        if (far := float(np.abs(moves).max())) > FAR:
+        if (far := float(np.abs(moves).max())) > MAX_WRAPPED_MOVE:
             raise OutputError(
-                f"molecules move by {far:.2f} of the box between two frames, and the frames hold them wrapped: their "
-                "paths cannot be told. Write output.positions = 'unwrapped', or frames more often"
+                f"molecules move by {far:.2f} of the box between two frames, in which they are wrapped: their paths "
+                "cannot be determined. Write output.positions = 'unwrapped', or frames more often"
             )
         inside[1:] = inside[0] + np.cumsum(moves, axis=0)
         position = np.einsum("fni,fij->fnj", inside, cells)
-        notes.append("frames hold wrapped molecules; their paths were made continuous")
+        notes.append("molecules are wrapped in the frames; their paths were made continuous")
     return Bodies(position, Q, velocity, L), notes

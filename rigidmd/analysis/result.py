@@ -1,4 +1,4 @@
-"""What analyses find: values with errors, curves, sentences; and how errors are made."""
+"""Results of analyses: values with errors, curves, notes; and how errors are estimated."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -7,23 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.history import History
-from rigidmd.core.statistics import error_of_mean, with_error
+from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.core.statistics import error_of_mean, format_with_error
 from rigidmd.run.rigid_fit import Kind
 
-#: Blocks of a history whose scatter gives errors. The error of an error is one third.
+#: Blocks of frames whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
 #: Groups of molecules at most, whose scatter gives errors too.
-GROUPS = 10
-#: Correlation times that a stretch must hold before it gives a value: those of the whole system, and those of single
-#: molecules, which are many and of which each block should see one at least.
-LEAST, LEAST_EACH = 20.0, float(BLOCKS)
+MAX_GROUPS = 10
+#: Least length of a run for a value, in correlation times: of the whole system, and of single molecules, of which there
+#: are many, and each block should be one correlation time long.
+MIN_CORRELATION_TIMES, MIN_MOLECULAR_TIMES = 20.0, float(BLOCKS)
 
 
 class Value(NamedTuple):
-    """A value with its standard error, or the sentence that tells why there is none.
+    """A value with its standard error, or a note on why there is none.
 
-    correlation_ps : time over which what it is made of forgets itself
+    correlation_ps : correlation time of the data
     """
 
     name: str
@@ -37,8 +37,8 @@ class Value(NamedTuple):
         if self.value is None:
             return f"{self.name}: {self.note}"
         unit = "" if self.unit in ("", "1") else f" {self.unit}"
-        told = f" ({self.note})" if self.note else ""
-        return f"{self.name}: {with_error(self.value, self.error)}{unit}{told}"
+        note = f" ({self.note})" if self.note else ""
+        return f"{self.name}: {format_with_error(self.value, self.error)}{unit}{note}"
 
 
 @dataclass(eq=False)
@@ -50,7 +50,7 @@ class Curve:
     columns, errors : header -> values (p,); errors under the same headers, where there are any
     log : whether axes are logarithmic: of x, of y
     level : a level to draw, such as 1 of g(r)
-    bars : whether the axis counts, so that bars are drawn
+    bars : whether the axis is of whole numbers, and bars are drawn
     """
 
     file: str
@@ -68,10 +68,10 @@ class Curve:
 
 
 @dataclass(eq=False)
-class Finding:
-    """What an analysis found: values, curves, notes.
+class AnalysisResult:
+    """The result of an analysis: values, curves, notes.
 
-    finding["g OW-OW"] is a column of its curves, finding.value("D of spce") a value.
+    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value.
     """
 
     name: str
@@ -105,54 +105,58 @@ class Finding:
     __repr__ = __str__
 
 
-def so_far(value: float, error: float | None = None, unit: str = "") -> str:
-    """What a run that is too short has given, in words."""
-    return f"So far: {with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
+def describe_so_far(value: float, error: float | None = None, unit: str = "") -> str:
+    """A phrase with the value from a run that is too short."""
+    return f"So far: {format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
 
 
-def settled(
+def converged_value(
     name: str, unit: str, value: float, error: float | None, span: float, correlation: float, note: str = "",
-    least: float = LEAST,
+    least: float = MIN_CORRELATION_TIMES,
 ) -> Value:  # fmt: skip
-    """A value made of a stretch of `span`, which has to be `least` correlation times long (both ps)."""
+    """A value from a run of length `span`, which has to be `least` correlation times long (both ps)."""
     if not correlation > 0 or not isfinite(value):
         return Value(name, unit, None, None, None, "the frames give no correlation time")
     if (lengths := span / correlation) < least:
-        told = (
+        note = (
             f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short for a value; "
-            f"{least:g} of them are {least * correlation:.3g} ps. {so_far(value, error, unit)}"
+            f"{least:g} of them are {least * correlation:.3g} ps. {describe_so_far(value, error, unit)}"
         )
-        return Value(name, unit, None, None, correlation, told)
+        return Value(name, unit, None, None, correlation, note)
     if error is None or not isfinite(error):
-        return Value(name, unit, None, None, correlation, f"too short for an error. {so_far(value, None, unit)}")
+        return Value(
+            name, unit, None, None, correlation, f"too short for an error. {describe_so_far(value, None, unit)}"
+        )
     return Value(name, unit, value, error, correlation, note)
 
 
-def blocks(history: History, count: int = BLOCKS) -> list[History]:
-    """A history in parts of equal length, without the first frames where it does not divide; none where a part would
-    have less than two frames."""
-    size = len(history) // count
+def split_in_blocks(frames: RigidFrames, count: int = BLOCKS) -> list[RigidFrames]:
+    """Frames in parts of equal length, without the first ones if they do not divide; none if parts would have less than
+    two frames."""
+    size = len(frames) // count
     if size < 2:
         return []
-    first = len(history) - size * count
-    return [history.part(first + k * size, first + (k + 1) * size) for k in range(count)]
+    first = len(frames) - size * count
+    return [frames.part(first + k * size, first + (k + 1) * size) for k in range(count)]
 
 
-def over_blocks(history: History, function: Callable[[History], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """An array that a function makes of a history, and its standard error, from what it makes of blocks."""
-    whole = np.asarray(function(history), float)
-    parts = [np.asarray(function(part), float) for part in blocks(history)]
+def with_block_error(
+    frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """An array computed from frames, and its standard error from blocks of them."""
+    whole = np.asarray(function(frames), float)
+    parts = [np.asarray(function(part), float) for part in split_in_blocks(frames)]
     return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
 
 
-def over_parts(
-    history: History, kind: Kind, function: Callable[[History, Kind], np.ndarray]
+def with_group_error(
+    frames: RigidFrames, kind: Kind, function: Callable[[RigidFrames, Kind], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An array that a function makes of the molecules of a species, and its standard error: the larger of two, from
-    blocks of the history and from groups of its molecules. Where motion repeats itself, as that of a gas, blocks are
-    alike; where molecules move together, groups are."""
-    whole, error = over_blocks(history, lambda part: function(part, kind))
-    if (count := min(GROUPS, len(kind.index))) > 1:
-        own = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))
-        error = np.fmax(error, error_of_mean([function(history, group) for group in own]))
+    """An array computed from the molecules of a species, and its standard error: the larger of two, from blocks of
+    frames and from groups of molecules. Blocks are too similar where motion repeats itself, as in a gas, and groups are
+    where molecules move together."""
+    whole, error = with_block_error(frames, lambda part: function(part, kind))
+    if (count := min(MAX_GROUPS, len(kind.index))) > 1:
+        groups = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))
+        error = np.fmax(error, error_of_mean([function(frames, group) for group in groups]))
     return whole, error
