@@ -195,7 +195,7 @@ RINGS = [
     Mutation(
         "B12", "standard errors of means forget the correlation of samples",
         "core/statistics.py",
-        "    return average, sqrt(max(window, OF_BATCHES * _of_batches(centred)) / lost / n)",
+        "    return average, sqrt(max(window, BATCH_FACTOR * _batch_variance(centred)) / kept / n)",
         "    return average, sqrt(variance / n)",
         ("test_drift.py::test_the_error_of_a_mean_is_as_large_as_its_scatter",),
     ),

@@ -19,9 +19,9 @@ from support import (
     move,
     orthogonality_error,
     random_rotations,
+    rotate,
     split_rotor,
     state_of,
-    turn,
 )
 
 from rigidmd.errors import SimulationError
@@ -424,7 +424,7 @@ def path(rotor, rotation, momentum, h, steps):
     seen = np.empty((steps, *momentum.shape))
     for n in range(steps):
         for m in range(len(momentum)):
-            turn(rotor, 0, rotation, momentum, m, h)
+            rotate(rotor, 0, rotation, momentum, m, h)
         seen[n] = momentum
     return seen
 

@@ -282,7 +282,7 @@ def test_a_task_is_called_by_its_address():
 
 @pytest.mark.parametrize("strange", [np.zeros((4, 4)).T[1], np.zeros(4, np.float32), np.zeros((2, 2))])
 def test_an_address_is_not_called_with_what_it_was_not_compiled_for(strange):
-    with pytest.raises(TypingError, match="add was compiled for parcel"):
+    with pytest.raises(TypingError, match="add was compiled for task_arguments"):
         add_once_and_in_blocks(content_of(strange), 2)
 
 

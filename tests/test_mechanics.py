@@ -19,21 +19,21 @@ from support import (
     orthogonality_error,
     principal_frame,
     random_rotations,
+    rotate,
     rotate_group,
     spin,
     split_rotor,
     state_of,
-    turn,
 )
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def turn_all(rotor, species, rotation, angular_momentum, h, together):
     if together:
         rotate_group(rotor, species, rotation, angular_momentum, 0, len(rotation), h)
     else:
         for m in range(len(rotation)):
-            turn(rotor, species[m], rotation, angular_momentum, m, h)
+            rotate(rotor, species[m], rotation, angular_momentum, m, h)
 
 
 @pytest.mark.parametrize("moments", ["of every kind", "of two axes", "round"])
@@ -73,7 +73,7 @@ def test_one_body_that_is_no_number_leaves_its_group_alone():
     assert np.array_equal(np.isnan(rotation).any(axis=(1, 2)), np.arange(20) == 7)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def kick_all(species, inverse_mass, inverse_inertia, state, load, h):
     kick_group(species, inverse_mass, inverse_inertia, state, load, 0, len(species), h)
 

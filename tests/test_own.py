@@ -32,10 +32,10 @@ from support import (
     formulas,
     kernel,
     lanes,
-    own_code,
     small_scene,
     tail_of_pair,
     truncation_terms,
+    user_modules,
 )
 from support import lennard_jones as built_in
 from support import lennard_jones_energy_and_force as of_built_in
@@ -725,16 +725,16 @@ def test_entries_of_custom_forces_are_checked(entry, word):
 def test_code_for_classes_of_users_has_an_index_of_its_own():
     index = CacheIndex("/nowhere", "f", 0)
     source = b"from typing import NamedTuple\nclass Term(NamedTuple):\n    x: float\n"
-    kept = own_code.module_of(source, "<test>").Term
-    assert own_code.module_of(source, "<test>").Term is kept  # one class for one text
-    assert own_code.module_of(source + b"\n", "<test>").Term is not kept
+    kept = user_modules.module_of(source, "<test>").Term
+    assert user_modules.module_of(source, "<test>").Term is kept  # one class for one text
+    assert user_modules.module_of(source + b"\n", "<test>").Term is not kept
 
     def key(value):
         return ((numba.typeof((value, 1.0)),), ())
 
     assert index._index_for(key(1.0)) is index
     assert index._index_for(key(Pair(1.0, 2.0))) is None  # of a module that may change: not kept
-    of_file = own_code.module_of(source, "<test>", own_code.OF_FILE).Term
+    of_file = user_modules.module_of(source, "<test>", user_modules.USER_FILE_PREFIX).Term
     assert index._index_for(key(of_file(1.0))) is None  # it may hold what it has read
     apart = index._index_for(key(kept(1.0)))
     assert apart._index_path not in (index._index_path, None)

@@ -38,7 +38,7 @@ from support import (
     end_of_row,
     largest_displacement,
     no_load,
-    packed,
+    pack_arguments,
 )
 
 from rigidmd import Scene, Simulation
@@ -55,14 +55,14 @@ ENDINGS = ("shift", "switch", "smooth_switch")
 def run_blocks(code, name, content, blocks, times):
     """All blocks of a task on this thread, so many times."""
     for _ in range(times):
-        call_blocks(code, literally(name), packed(content), blocks)
+        call_blocks(code, literally(name), pack_arguments(content), blocks)
 
 
 @njit
 def run_once(code, name, content, times):
     """A task that has one block, so many times."""
     for _ in range(times):
-        call(code, literally(name), packed(content))
+        call(code, literally(name), pack_arguments(content))
 
 
 @njit
@@ -126,7 +126,9 @@ def measure(job: dict) -> list[dict]:
     for name, term in engine.workspaces.items():
         if isinstance(term, PairWorkspace):
             every = STEPS / max(1, builds_of(term) - builds[name])
-            found.append(common | {"kernel": f"{name}, {type(term.slot_potential).__name__}"} | of_pairs(term, state, every))
+            found.append(
+                common | {"kernel": f"{name}, {type(term.slot_potential).__name__}"} | of_pairs(term, state, every)
+            )
         elif hasattr(term, "mesh"):
             found.append(common | {"kernel": name, "mesh": of_mesh(term)})
     return found
