@@ -256,7 +256,7 @@ def leaves(value: object, path: tuple = ()) -> list[tuple]:
 def forge(folder: Path, rng: random.Random) -> str:
     """Write a checkpoint with another value, with right checksums; what was changed."""
     kept = read_checkpoint(folder / CHECKPOINT)
-    told, arrays = copy.deepcopy(kept.told), dict(kept.arrays)
+    told, arrays = copy.deepcopy(kept.values), dict(kept.arrays)
     if rng.random() < 0.5:
         *way, last = path = rng.choice(leaves(told)[1:])
         holder = functools.reduce(lambda part, key: part[key], way, told)
@@ -282,7 +282,7 @@ def forge(folder: Path, rng: random.Random) -> str:
         else:
             arrays[name] = changed
         name += f": {how}"
-    write_checkpoint(folder, kept._replace(told=told, arrays=arrays))
+    write_checkpoint(folder, kept._replace(values=told, arrays=arrays))
     return name
 
 

@@ -83,7 +83,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F12", "bias of a mean against the step: its error forgets that the limit is made of the same mean",
         "studies/accuracy/bias.py",
-        "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - own) * point.error) ** 2)",
+        "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
         ("test_accuracy.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",),
     ),
@@ -202,8 +202,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F29", "GROMACS: a virtual site off its plane, 1/Å for 1/nm",
         "engines/gromacs/files.py",
-        "{place.cross / NM:.12g}",
-        "{place.cross:.12g}",
+        "{site.cross / NM:.12g}",
+        "{site.cross:.12g}",
         ("test_engine_settings.py::test_gromacs_places_a_site_off_the_plane_of_its_masses",),
     ),
     Mutation(

@@ -202,8 +202,8 @@ RINGS = [
     Mutation(
         "B13", "unbiased temperatures: dt²/8 for dt²/12",
         "engines/observables.py",
-        "    slant = verlet_step**2 / 12",
-        "    slant = verlet_step**2 / 8",
+        "    correction = verlet_step**2 / 12",
+        "    correction = verlet_step**2 / 8",
         (
             "test_wiring.py"
             "::test_unbiased_temperatures_are_those_of_the_kinetic_energies_and_a_twelfth_of_the_forces",

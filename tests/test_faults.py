@@ -290,7 +290,7 @@ def read_back(folder: Path, name: str) -> bytes | dict[str, bytes]:
         assert all(CHECKPOINT in fault for fault in faults)
         return {name: array.tobytes() for name, array in kept.arrays.items()}
     owner = {LOG: "LogFile", TRAJECTORY: "Frames"}[name]
-    size, checksum = next(part["kept"] for who, part in kept.told["of"].items() if who == owner)[:2]
+    size, checksum = next(part["kept"] for who, part in kept.values["of"].items() if who == owner)[:2]
     found = AppendedFile(folder / name, (size, checksum))
     found.cut()
     found.close()

@@ -23,7 +23,7 @@ from support import (
     Molecule,
     Site,
     TrajectoryFile,
-    basis_in_words,
+    describe_basis,
     basis_of,
     build,
     built,
@@ -37,7 +37,7 @@ from support import (
     random_rotations,
     read_geometry,
     read_structure,
-    reduced,
+    reduced_cell,
     small_scene,
     standard_rotation,
     with_masses,
@@ -567,9 +567,9 @@ def test_the_standard_orientation_keeps_the_lattice():
 )
 def test_a_cell_leans_by_half_an_edge_as_far_as_files_tell(angles, told):
     cell = Box(lengths_A=36.0, angles_deg=angles).cell
-    other = reduced(cell)
+    other = reduced_cell(cell)
     basis = basis_of(other, cell)
-    assert basis_in_words(basis) == told
+    assert describe_basis(basis) == told
     assert np.array_equal(other, cell) == (not told)
     assert basis @ cell == pytest.approx(other, abs=1e-12)
     assert abs(np.linalg.det(basis)) == pytest.approx(1)

@@ -12,7 +12,7 @@ from scenes import FORTY_WATERS, NVT, forty_waters
 from support import (
     FORMATS,
     Frame,
-    _evened,
+    _without_rounding,
     build,
     from_files,
     in_memory,
@@ -149,10 +149,10 @@ def test_times_in_single_precision_are_evened_where_they_can_be():
     times = 4.3e6 + 0.1 * np.arange(200)
     rounded = times.astype(np.float32).astype(float)
     assert np.diff(rounded).min() == 0
-    assert _evened(rounded) == pytest.approx(times, abs=0.3)
-    assert np.diff(_evened(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
+    assert _without_rounding(rounded) == pytest.approx(times, abs=0.3)
+    assert np.diff(_without_rounding(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
     for uneven in (np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]), np.array([2.0]), np.array([])):
-        assert np.array_equal(_evened(uneven), uneven)
+        assert np.array_equal(_without_rounding(uneven), uneven)
 
 
 @pytest.mark.parametrize("ending", [".xtc", ".trr", ".gsd", ".dcd", ".nc"])
@@ -184,7 +184,7 @@ def test_the_last_frame_of_a_trajectory(ending, names, tmp_path):
 @pytest.mark.parametrize(
     ("ending", "fault", "said"),
     [
-        (".xtc", "no names", "there is no topology.gro or topology.pdb beside it: name a file"),
+        (".xtc", "no names", "there is no topology.gro or topology.pdb next to it: name a file"),
         (".xtc", "other names", "it has 16 atoms, the file with their names 3"),
         (".dcd", "noise", "cannot be read as a trajectory"),
         (".trr", "empty", "cannot be read as a trajectory"),

@@ -1,4 +1,4 @@
-"""Molecules as an `ase.Atoms`: the sites that have mass, in ASE's units."""
+"""Molecules as an `ase.Atoms`: the sites with mass, in ASE's units."""
 
 from typing import TYPE_CHECKING
 
@@ -13,26 +13,21 @@ from rigidmd.units import ENERGY_UNITS
 if TYPE_CHECKING:
     import ase
 
-#: One eV in u Å²/ps².
 EV = ENERGY_UNITS["eV"]
 HEAVY = ("D", "T")
 
 
 def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase.Atoms":
-    """A state of a system, exactly: see `atoms_of_sites`."""
+    """A state of a system as an `ase.Atoms`, see `atoms_of_sites`."""
     return atoms_of_sites(
-        system,
-        system.site_positions(state, wrapped),
-        system.site_velocities(state),
-        state.cell,
-        float(state.time[NOW]),
+        system, system.site_positions(state, wrapped), system.site_velocities(state), state.cell, float(state.time[NOW])
     )
 
 
 def atoms_of_sites(
     system: System, positions: np.ndarray, velocities: np.ndarray | None, cell: np.ndarray | None, time: float
 ) -> "ase.Atoms":
-    """The sites with mass as an `ase.Atoms`, with the masses of the models, names and residues, `info["time_ps"]`.
+    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and `info["time_ps"]`.
 
     positions, velocities : (s, 3) of all sites, Å and Å/ps; cell : (3, 3) Å, None or infinite without a box
     """
@@ -43,13 +38,9 @@ def atoms_of_sites(
     symbols = ["H" if e in HEAVY else e if is_element(e) else "X" for e in sites.element[atom]]
     boxed = cell is not None and bool(np.isfinite(cell).all())
     found = ase.Atoms(
-        symbols,
-        positions=np.asarray(positions, float)[atom],
-        masses=sites.mass[atom],
-        cell=cell if boxed else None,
-        pbc=boxed,
-        info={"time_ps": time},
-    )
+        symbols, positions=np.asarray(positions, float)[atom], masses=sites.mass[atom], cell=cell if boxed else None,
+        pbc=boxed, info={"time_ps": time},
+    )  # fmt: skip
     if velocities is not None:
         found.set_velocities(np.asarray(velocities, float)[atom] / ASE_VELOCITY)
     of_atom = sites.molecule[atom]

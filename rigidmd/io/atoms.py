@@ -1,11 +1,15 @@
-"""The atoms of a structure file, and elements from names and masses."""
+"""Atoms of structure files, frames in memory, and elements from names and masses."""
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-SAME_MASS = 0.01  # masses that differ by less than this fraction are those of one element
+from rigidmd.errors import StructureError
+
+SAME_MASS = 0.01  # relative difference of the masses of one element
 HEAVY_HYDROGEN = {"D": 2.014101777844, "T": 3.01604928132}  # u, AME2020; ASE has no symbols for them
 #: Names of ions in CHARMM's force fields that do not begin with their elements.
 CHARMM_IONS = {"SOD": "Na", "POT": "K", "CES": "Cs", "CLA": "Cl", "LIT": "Li", "RUB": "Rb", "CAL": "Ca", "BAR": "Ba"}
@@ -22,10 +26,15 @@ class Atoms(NamedTuple):
     elements: list[str]  # "" if the format has only names; X for massless sites, D and T for heavy hydrogen
     residue: list[tuple]  # (number or None, name, ...), differs between neighbours; () without residues
     position: np.ndarray  # (n, 3) Å
-    velocity: np.ndarray | None  # (n, 3) Å/ps; rows of NaN for atoms without one
-    cell: np.ndarray | None  # (3, 3), rows a, b, c, Å
-    masses: np.ndarray | None  # (n,) u, where the file gives them
-    notes: list[str]
+    velocity: np.ndarray | None = None  # (n, 3) Å/ps; rows of NaN for atoms without one
+    cell: np.ndarray | None = None  # (3, 3), rows a, b, c, Å
+    masses: np.ndarray | None = None  # (n,) u, if the file has masses
+    notes: Sequence[str] = ()
+
+
+def structure_error(path: Path, message: str) -> StructureError:
+    """The exception for one error in a structure file."""
+    return StructureError(str(path), [message])
 
 
 def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
@@ -53,3 +62,17 @@ def element_of_mass(mass: float) -> str:
     known = {e: float(m) for e, m in zip(chemical_symbols, atomic_masses, strict=True) if e != "X"} | HEAVY_HYDROGEN
     nearest = min(known, key=lambda element: abs(known[element] - mass))
     return nearest if abs(known[nearest] - mass) <= SAME_MASS * mass else ""
+
+
+class Frame(NamedTuple):
+    """A frame of a run in memory. If a trajectory file is written, only its time is kept."""
+
+    time: float  # ps
+    positions: np.ndarray | None = None  # (s, 3) sites, Å
+    cell: np.ndarray | None = None  # (3, 3) Å
+    velocities: np.ndarray | None = None  # (s, 3) sites, Å/ps
+    rotation: np.ndarray | None = None  # (n, 3, 3) molecules
+
+    @property
+    def sites(self) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+        return self.positions, self.velocities, self.cell

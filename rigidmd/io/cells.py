@@ -1,4 +1,4 @@
-"""Periodic cells of any shape and orientation, as files give them. Rows a, b, c, lab frame, Å."""
+"""Periodic cells of any shape and orientation, as in structure files. Rows a, b, c, lab frame, Å."""
 
 from itertools import product
 from math import acos, degrees, hypot
@@ -6,37 +6,37 @@ from operator import mul
 
 import numpy as np
 
-#: Edges with a cosine up to this are at right angles: files print angles to 0.01 degrees, vectors to 1e-5 or better.
+#: Largest cosine of right angles: files have angles to 0.01 degrees, vectors to 1e-5 or better.
 RIGHT = np.radians(1e-3)
-#: A cell within this fraction of its longest edge of the standard orientation is not rotated.
+#: A cell is in the standard orientation within this fraction of its longest edge.
 ORIENTED = 1e-6
 
-#: Tilt beyond half an edge, as a fraction of the edge, that is tolerated: 36 cos 60° is 18.000000000000004, and files
-#: print vectors to 1e-4 Å, angles to 0.01 degrees. Neighbour lists are correct for any tilt.
+#: Tolerated tilt beyond half an edge, as a fraction of the edge: 36 cos 60° is 18.000000000000004, and vectors in files
+#: have 1e-4 Å, angles 0.01 degrees. Neighbour lists are correct for any tilt.
 HALF_AS_PRINTED = 1e-4
-#: Factor by which another choice of edges must raise the longest possible cut-off before the cell is rotated for it.
-ROOMIER = 1.1
-#: Edges and thicknesses of cells that hold atoms, Å: from half an atom to a tenth of a metre.
+#: The cell is rotated for another choice of edges if that raises the longest possible cutoff by this factor.
+CUTOFF_GAIN = 1.1
+#: Smallest thickness and longest edge of a cell, Å: half an atom, a tenth of a metre.
 THINNEST, LONGEST = 0.5, 1e9
 
 
-def cell_fault(cell: np.ndarray) -> str:
-    """Why a cell (3, 3) of finite numbers holds no molecules; empty if it may hold some."""
+def cell_error(cell: np.ndarray) -> str:
+    """Why a cell (3, 3) of finite numbers cannot hold molecules; empty if it can."""
     if np.abs(cell).max() > LONGEST:
         return f"it must not be longer than {LONGEST:g} Å"
     edges = np.linalg.norm(cell, axis=1)
-    told = f"its edges of {', '.join(f'{edge:.4g}' for edge in edges)} Å"
     areas = np.linalg.norm(np.cross(np.roll(cell, -1, axis=0), np.roll(cell, 1, axis=0)), axis=1)
     thickness = np.abs(np.linalg.det(cell)) / areas.max() if areas.max() > 0 else 0.0
     if thickness < THINNEST:
-        return f"with {told} it is {thickness:.3g} Å thin, must be {THINNEST:g} Å at least"
+        lengths = ", ".join(f"{edge:.4g}" for edge in edges)
+        return f"with its edges of {lengths} Å it is {thickness:.3g} Å thick, must be {THINNEST:g} Å at least"
     return ""
 
 
 def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) to that orientation.
 
-    The new rows are R times the old ones. Of a left-handed cell c changes sign, which leaves the lattice the same.
+    The new rows are R times the old ones. In a left-handed cell c changes sign, which does not change the lattice.
     """
     cell = cell * np.array([1, 1, np.sign(np.linalg.det(cell))])[:, None]
     longest = np.abs(cell).max()
@@ -47,8 +47,8 @@ def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.tril(cell @ q), q.T
 
 
-def reduced(cell: np.ndarray) -> np.ndarray:
-    """A cell (3, 3) of the same lattice, in standard orientation, with tilts up to half an edge (to printed digits)."""
+def reduced_cell(cell: np.ndarray) -> np.ndarray:
+    """A cell (3, 3) of the same lattice in standard orientation, with tilts up to half an edge, to printed digits."""
     cell = cell.copy()
     for k, along in ((2, 1), (2, 0), (1, 0)):
         edges = cell[k, along] / cell[along, along]
@@ -69,47 +69,47 @@ def same_lattice(cell: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
     return whole and bool(np.abs(basis @ other - cell).max() <= tolerance * np.abs(other).max())
 
 
-def edges_in_words(cell: np.ndarray) -> str:
+def describe_cell(cell: np.ndarray) -> str:
     """Lengths and angles of a cell (3, 3)."""
     found = edges_and_angles(cell)
     lengths, angles = ", ".join(f"{x:.4f}" for x in found[:3]), ", ".join(f"{x:.4g}" for x in found[3:])
     return f"edges {lengths} Å, angles {angles}°"
 
 
-def basis_in_words(basis: np.ndarray) -> str:
-    """The edges a', b', c' that differ from a, b, c, as "c' = c - a"."""
-    told = []
+def describe_basis(basis: np.ndarray) -> str:
+    """The edges a', b', c' that differ from a, b, c, for example "c' = c - a"."""
+    changed = []
     for k, row in enumerate(basis):
         parts = [(n, i) for i, n in enumerate(row) if n]
         parts.sort(key=lambda part: part[1] != k)
         if parts != [(1, k)]:
             sums = " ".join(f"{'-' if n < 0 else '+'} {'' if abs(n) == 1 else abs(n)}{'abc'[i]}" for n, i in parts)
-            told.append(f"{'abc'[k]}' = {sums.removeprefix('+ ')}")
-    return ", ".join(told)
+            changed.append(f"{'abc'[k]}' = {sums.removeprefix('+ ')}")
+    return ", ".join(changed)
 
 
 def least_skewed_cell(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (3, 3) of a lattice that allows the longer cut-off, and the rotation (3, 3) to its standard orientation.
+    """The cell (3, 3) of a lattice that allows the longer cutoff, and the rotation (3, 3) to its standard orientation.
 
-    The given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cut-off: half the smallest
-    of a_x, b_y, c_z.
+    This is the given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cutoff: half the
+    smallest of a_x, b_y, c_z.
     """
     from ase.geometry import minkowski_reduce
 
-    own = reduced(cell)
-    other, turn = standard_rotation(np.asarray(minkowski_reduce(cell)[0]))
-    other = reduced(other)
-    return (other, turn) if np.diag(other).min() > ROOMIER * np.diag(own).min() else (own, np.eye(3))
+    given = reduced_cell(cell)
+    other, rotation = standard_rotation(np.asarray(minkowski_reduce(cell)[0]))
+    other = reduced_cell(other)
+    return (other, rotation) if np.diag(other).min() > CUTOFF_GAIN * np.diag(given).min() else (given, np.eye(3))
 
 
 def right_angled(cell: np.ndarray) -> bool:
-    """Whether the edges of a cell (3, 3) are at right angles, to the digits that files print."""
+    """Whether the edges of a cell (3, 3) are at right angles, to the digits of files."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]
     return bool(np.abs((unit @ unit.T)[np.triu_indices(3, 1)]).max() <= RIGHT)
 
 
 def edges_and_angles(cell: np.ndarray) -> list[float]:
-    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3); without NumPy, which takes ten times as long."""
+    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3). NumPy would take ten times as long."""
     a, b, c = cell.tolist()
     edges = [hypot(*edge) for edge in (a, b, c)]
     pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
@@ -125,7 +125,7 @@ def angles_deg(cell: np.ndarray) -> list[float]:
 def pairs_within(
     position: np.ndarray, cell: np.ndarray | None, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs i, j of points (n, 3) within a radius, periodic images in any cell (3, 3) included, and their distances."""
+    """Pairs i, j of points (n, 3) within a radius, with periodic images in any cell (3, 3), and their distances."""
     from scipy.spatial import KDTree
 
     points, owner = position, np.arange(len(position))

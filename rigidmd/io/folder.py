@@ -1,4 +1,4 @@
-"""The folder of a run: it is never overwritten without --force, and its files are complete or absent."""
+"""The folder of a run. It is never overwritten without --force, and its files are complete or absent."""
 
 import os
 from collections.abc import Iterable
@@ -6,31 +6,31 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from rigidmd.core.files import file_fault, is_temporary, write_text
-from rigidmd.core.toml import cut
+from rigidmd.core.files import is_temporary, unreadable_reason, write_text
+from rigidmd.core.toml import shorten_text
 from rigidmd.errors import OutputError
 from rigidmd.io.write import writing
 
-#: Files of a run; the scene names trajectory and topology.
+#: Names of files of a run. The scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
 FINAL, LAST_GOOD, ENERGY, SUMMARY = "final.npz", "last_good_state.npz", "energy.png", "summary.json"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
-#: Marks the folder of a run and lists the files that the run may write, one a line; --force may remove these.
+#: Marks the folder of a run and lists the files that the run may write, one per line. --force may remove them.
 MARKER = ".rigidmd-run"
 LOCK = ".rigidmd-lock"
-#: The manifest of a sweep, in the folder around those of its runs.
+#: The manifest of a sweep, in the parent folder of its runs.
 SWEEP = "sweep.json"
 
 
 def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: Iterable[str] = ()) -> None:
-    """Raise OutputError if a run could not be written there, or would remove one of its inputs; changes nothing.
+    """Raise OutputError if a run cannot be written to a folder, or would remove one of its inputs. Changes nothing.
 
-    names : files that the run will write; of those that are there, an earlier run must have written all
+    names : files that the run will write; existing ones must have been written by an earlier run
     """
     try:
         exists = folder.exists()
     except OSError as error:  # a name that is too long
-        raise OutputError(f"{cut(str(folder))} cannot be written: {error.strerror}") from None
+        raise OutputError(f"{shorten_text(str(folder))} cannot be written: {error.strerror}") from None
     if exists:
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
@@ -39,15 +39,12 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: 
                 raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
             if not force:
                 resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
-                raise OutputError(
-                    f"{folder} holds an earlier run; {resume}--force replaces it, -o names another folder"
-                )
-            doomed = {(folder / name).resolve() for name in written_by_runs(folder)}
-            for path in inputs:
-                if path.resolve() in doomed:
-                    raise OutputError(
-                        f"{path} is an input of this run and would be replaced; name another folder with -o"
-                    )
+                hint = f"{resume}--force replaces it, -o names another folder"
+                raise OutputError(f"{folder} holds an earlier run; {hint}")
+            replaced = {(folder / name).resolve() for name in written_by_runs(folder)}
+            if used := [path for path in inputs if path.resolve() in replaced]:
+                problem = f"{used[0]} is an input of this run and would be replaced"
+                raise OutputError(f"{problem}; name another folder with -o")
             check_names(folder, names)
     parent = folder
     while not parent.exists():
@@ -59,11 +56,9 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: 
 def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
     """Raise OutputError if a file of one of these names is in a folder whose marker does not list it."""
     known = {*written_by_runs(folder, marker), marker, LOCK}
-    if strange := [name for name in names if name not in known and os.path.lexists(folder / name)]:
-        raise OutputError(
-            f"{folder / strange[0]} exists, was not written by rigidmd, and would be replaced; "
-            "move it away, or name another place with -o"
-        )
+    if foreign := [name for name in names if name not in known and os.path.lexists(folder / name)]:
+        problem = f"{folder / foreign[0]} exists, was not written by rigidmd, and would be replaced"
+        raise OutputError(f"{problem}; move it away, or name another folder with -o")
 
 
 def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
@@ -74,9 +69,9 @@ def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> No
 def make_folder(
     folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = (), lock: "FolderLock | None" = None
 ) -> None:
-    """Make the folder of a run that will write these files. Of an earlier run only the files that it wrote are removed.
+    """Make the folder of a run that will write these files. Only files that an earlier run wrote are removed.
 
-    lock : taken as soon as there is a folder. Raises OutputError.
+    lock : taken as soon as the folder exists. Raises OutputError.
     """
     names = list(names)
     check_folder(folder, force, inputs, names)
@@ -91,7 +86,7 @@ def make_folder(
 
 
 def continue_folder(folder: Path, names: Iterable[str]) -> None:
-    """Go on in the folder of a run that will also write these files. Its summary is no longer true and is removed.
+    """Resume in the folder of a run that will also write these files. Its summary is outdated and removed.
 
     Raises OutputError.
     """
@@ -101,7 +96,7 @@ def continue_folder(folder: Path, names: Iterable[str]) -> None:
 
 
 def check_is_run(folder: Path) -> None:
-    """Raise OutputError if a folder is not that of a run."""
+    """Raise OutputError unless a run has written to a folder."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "is not there"
         raise OutputError(f"{folder} {what}; name the folder of a run, such as runs/water")
@@ -112,14 +107,14 @@ def check_is_run(folder: Path) -> None:
 
 
 def add_to_folder(folder: Path, names: Iterable[str]) -> None:
-    """Note files that are made from a run beside its own: a new run in the folder removes them. Raises OutputError."""
+    """List files that are made from a run, so that a new run in the folder removes them. Raises OutputError."""
     names = list(names)
     check_names(folder, names)
     write_marker(folder, [*written_by_runs(folder), *names])
 
 
 class FolderLock:
-    """Keeps other runs out of a folder. The system ends it with the process, however that ends."""
+    """Keeps other runs out of a folder. The operating system releases it when the process ends in any way."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -127,11 +122,10 @@ class FolderLock:
 
     @property
     def is_taken(self) -> bool:
-        """Whether this process has it."""
         return self._lock.is_locked
 
     def take(self) -> None:
-        """Take it unless it is taken already or the folder does not exist. Raises OutputError."""
+        """Take the lock unless it is taken already or the folder does not exist. Raises OutputError."""
         if self.is_taken or not self._folder.is_dir():
             return
         try:
@@ -142,33 +136,32 @@ class FolderLock:
             raise OutputError(f"{self._folder} cannot be written: {error.strerror}") from None
 
     def release(self) -> None:
-        """Let others in."""
         self._lock.release()
 
 
 def never_began(folder: Path) -> bool:
-    """Whether a run was ended in a folder before its first checkpoint: nothing is lost if it begins again."""
+    """Whether a run ended before its first checkpoint, so that nothing is lost if it is started again."""
     ended = (CHECKPOINT, PREVIOUS, FINAL, LAST_GOOD, SUMMARY, MOTION)
     if CHECKPOINT not in written_by_runs(folder) or any((folder / name).exists() for name in ended):
         return False
     log = folder / LOG
     with writing(log, "read"):
-        is_short = not file_fault(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
+        is_short = not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
     return is_short or not log.exists()
 
 
 def offsets_of(trajectory: Path) -> list[Path]:
-    """The files that MDAnalysis writes beside a trajectory that it reads."""
-    return [trajectory.with_name(f".{trajectory.name}_offsets.{ending}") for ending in ("npz", "lock")]
+    """The files that MDAnalysis writes next to a trajectory that it reads."""
+    return [trajectory.with_name(f".{trajectory.name}_offsets.{extension}") for extension in ("npz", "lock")]
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether a folder is absent or holds nothing but a lock, and what was left by a run that was killed at once."""
+    """Whether a folder is absent or has only a lock and temporary files of a run that was killed."""
     return not folder.exists() or all(path.name == LOCK or is_temporary(path) for path in folder.iterdir())
 
 
 def written_by_runs(folder: Path, marker: str = MARKER) -> list[str]:
-    """Files that an earlier run in this folder may have written; only plain names, whatever its marker contains."""
+    """Files that an earlier run in this folder may have written. Only plain names in its marker are used."""
     path = folder / marker
     with writing(path, "read"):
         names = path.read_text(encoding="utf-8", errors="replace").split("\n") if path.is_file() else []

@@ -1,6 +1,6 @@
-"""log.csv: one line a sample, soon on the disk, so that a killed run keeps its samples.
+"""The files log.csv and pressure_tensor.csv. Lines are soon on the disk, so that a killed run keeps its samples.
 
-The first columns are those of OpenMM's StateDataReporter.
+The first columns of log.csv are the same as in OpenMM's StateDataReporter.
 """
 
 import csv
@@ -11,33 +11,37 @@ from math import inf
 from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
+
 from rigidmd.core.files import AppendedFile
 from rigidmd.engines import samples
 from rigidmd.engines.samples import Sample
+from rigidmd.errors import OutputError
+from rigidmd.io.run_files import read_columns
 
-#: Seconds that a line may wait for others, which together take a tenth of the time, and after which it waits for none.
+#: Seconds that a line waits for others, which together take a tenth of the time. Lines at longer intervals do not wait.
 DELAY, SELDOM = 0.5, 0.05
-#: Columns that are written on request.
+#: Columns of log.csv that are written on request.
 TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
 
 
-def columns(tensor: bool = True, own: Sequence[str] = ()) -> dict[str, str]:
-    """Name of each column -> its header; with or without the pressure tensor; own : the user's own forces."""
-    described = samples.COLUMNS | samples.own_columns(own)
+def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, str]:
+    """Name of each column -> its header, with or without the pressure tensor, and with user-defined forces."""
+    described = samples.COLUMNS | samples.user_columns(user_terms)
     written = {name: column.header for name, column in described.items() if column.header}
     return written if tensor else {name: header for name, header in written.items() if name not in TENSOR}
 
 
 class Log(AppendedFile):
-    """Writes samples to a CSV file, numbers with all significant digits; missing values are empty. Raises OutputError.
+    """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises OutputError.
 
-    kept : `kept` of an earlier time, at which an existing file goes on; None begins a new file
-    own : names of the user's own forces
+    kept : earlier value of the property `kept`, from which the file is continued; None begins a new file
+    user_terms : names of user-defined forces
     """
 
-    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, own: Sequence[str] = ()):
-        self._columns = columns(tensor, own)
-        shared = [name for name in self._columns if name not in own]
+    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, user_terms: Sequence[str] = ()):
+        self._columns = columns(tensor, user_terms)
+        shared = [name for name in self._columns if name not in user_terms]
         self._values = attrgetter(*shared)
         self._time = shared.index("time")
         self._rows: list[list] = []
@@ -49,13 +53,13 @@ class Log(AppendedFile):
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Bytes so far, all of them on the disk, and their checksum."""
+        """Number of bytes, all on the disk, and their checksum."""
         self.flush()
         return super().kept
 
     def write(self, sample: Sample) -> None:
-        """Add a line. It is written at once if none came shortly before."""
-        row = [*self._values(sample), *sample.own]
+        """Add a line. It is written at once unless another one came shortly before."""
+        row = [*self._values(sample), *sample.user_energies]
         row[self._time] = round(sample.time, 9)
         self._rows.append(row)
         now = clock.monotonic()
@@ -65,7 +69,7 @@ class Log(AppendedFile):
             self._written = now
 
     def flush(self) -> None:
-        """Write all lines so far. Those that cannot be written are lost, as their sample stops the run."""
+        """Write the waiting lines. Lines that cannot be written are lost, because the error stops the run."""
         rows, self._rows = self._rows, []
         if not rows:
             return
@@ -75,8 +79,38 @@ class Log(AppendedFile):
         self.append(lines.getvalue().encode())
 
     def close(self) -> None:
-        """Write the rest and close the file."""
         try:
             self.flush()
         finally:
             super().close()
+
+
+TENSOR_FILE = "pressure_tensor.csv"
+COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
+HEADER = ["Time (ps)", *(f"Pressure {name} (bar)" for name in COMPONENTS)]
+
+
+def tensor_row(time: float, tensor: np.ndarray) -> list[float]:
+    """A line of pressure_tensor.csv: time (ps) and six components of a symmetric tensor (3, 3), bar."""
+    return [round(time, 9), *(float(tensor["xyz".index(a), "xyz".index(b)]) for a, b in COMPONENTS)]
+
+
+class TensorFile(AppendedFile):
+    """Writes pressure_tensor.csv, for viscosities. See `Log` for `kept`. Raises OutputError."""
+
+    def __init__(self, path: Path, kept: Sequence[int] | None = None):
+        super().__init__(path, kept)
+        if kept is None:
+            self.append((",".join(f'"{title}"' for title in HEADER) + "\n").encode())
+
+    def write(self, row: list[float]) -> None:
+        self.append((",".join(map(repr, row)) + "\n").encode())
+
+
+def read_tensor(path: Path) -> np.ndarray | None:
+    """Complete lines (n, 7) of pressure_tensor.csv; None without a file. Raises OutputError."""
+    if (found := read_columns(path)) is None:
+        return None
+    if list(found.cells) != HEADER:
+        raise OutputError(f"{path} is not a pressure tensor of rigidmd: its columns must be {', '.join(HEADER)}")
+    return np.array([found.numbers(header, finite=True) for header in HEADER]).T

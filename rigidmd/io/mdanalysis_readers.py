@@ -1,4 +1,4 @@
-"""Readers of trajectories for MDAnalysis: of formats that it reads otherwise or not, and with the times of a run."""
+"""Readers of trajectories for MDAnalysis: of GSD and ASE files as sites, and of all formats with the times of a run."""
 
 from math import inf
 from pathlib import Path
@@ -27,7 +27,7 @@ def dimensions(cell: np.ndarray) -> list[float] | None:
 
 
 class _Sites(ReaderBase):
-    """All sites of a file in the order of the scene, molecules whole, where the box begins at the origin."""
+    """Base of readers of all sites in the order of the scene. Molecules are whole and the box begins at the origin."""
 
     units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
     _file: Any
@@ -62,7 +62,7 @@ class _Sites(ReaderBase):
 
     def _read_frame(self, i):
         if not 0 <= i < self.n_frames:
-            raise OSError(f"there is no frame {i}")
+            raise OSError(f"frame {i} does not exist")
         positions, velocities, cell, time, step = self._take(i)
         self._frame = self.ts.frame = i
         self.ts.positions = positions
@@ -78,7 +78,7 @@ class _Sites(ReaderBase):
 
 
 class SitesOfGSD(_Sites):
-    """A .gsd file. MDAnalysis' own reader returns central particles too, and positions in the box."""
+    """A .gsd file. MDAnalysis' reader returns central particles too, and wrapped positions."""
 
     def _open(self, path: Path) -> None:
         self._file = GsdReader(path)
@@ -92,7 +92,7 @@ class SitesOfGSD(_Sites):
 
 
 class SitesOfTraj(_Sites):
-    """A .traj file of ASE that rigidmd wrote; MDAnalysis has single precision."""
+    """A .traj file of ASE that rigidmd wrote. MDAnalysis has single precision."""
 
     def _open(self, path: Path) -> None:
         self._file = TrajReader(path)
@@ -104,17 +104,16 @@ class SitesOfTraj(_Sites):
 
 
 class _Timed(ProtoReader):
-    """Makes a reader return the times of the run (ps), evenly spaced or not, whatever its file holds."""
+    """Mixin for a reader that returns the times of the run (ps), evenly spaced or not, instead of those in the file."""
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
         self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
-        super().__init__(*source, **options | {"times": times})  # readers give all their options to copies
+        super().__init__(*source, **options | {"times": times})  # a reader passes its options to its copies
         self._timed(self.ts)
 
     @property
     def totaltime(self) -> float:
-        """From the first frame to the last, ps."""
         return self._times[-1] - self._times[0]
 
     def _timed(self, frame):
@@ -130,36 +129,18 @@ class _Timed(ProtoReader):
         return self._timed(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
-class TimedFrames(_Timed, MemoryReader): ...
+def _with_times(reader: Any) -> Any:
+    """A subclass of a reader with the times of the run. It is a name of this module, so that readers can be pickled."""
+    name = f"Timed{reader.__name__}"
+    globals()[name] = type(reader)(name, (_Timed, reader), {"__module__": __name__})
+    return globals()[name]
 
 
-class _TimedXTC(_Timed, XTCReader): ...
-
-
-class _TimedTRR(_Timed, TRRReader): ...
-
-
-class _TimedDCD(_Timed, DCDReader): ...
-
-
-class _TimedNCDF(_Timed, NCDFReader): ...
-
-
-class _TimedGSD(_Timed, SitesOfGSD): ...
-
-
-class _TimedTraj(_Timed, SitesOfTraj): ...
-
-
-class _TimedXYZ(_Timed, XYZReader): ...
-
-
-class _TimedPDB(_Timed, PDBReader): ...
-
-
+TimedFrames = _with_times(MemoryReader)
+#: Readers by extension, and MDAnalysis' name of a format, or the reader, if it is not the extension.
 TIMED = {
-    ".xtc": _TimedXTC, ".trr": _TimedTRR, ".gsd": _TimedGSD, ".traj": _TimedTraj, ".dcd": _TimedDCD, ".nc": _TimedNCDF,
-    ".xyz": _TimedXYZ, ".pdb": _TimedPDB,
+    ".xtc": _with_times(XTCReader), ".trr": _with_times(TRRReader), ".gsd": _with_times(SitesOfGSD),
+    ".traj": _with_times(SitesOfTraj), ".dcd": _with_times(DCDReader), ".nc": _with_times(NCDFReader),
+    ".xyz": _with_times(XYZReader), ".pdb": _with_times(PDBReader),
 }  # fmt: skip
-#: What MDAnalysis calls a format, or the reader itself, where it is not the ending.
 FORMATS = {".nc": "NCDF", ".gsd": SitesOfGSD, ".traj": SitesOfTraj}

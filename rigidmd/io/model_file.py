@@ -1,4 +1,4 @@
-"""A molecular model as a TOML file, like those that are shipped."""
+"""Writer of a molecular model as a TOML file."""
 
 import json
 from pathlib import Path
@@ -6,17 +6,17 @@ from pathlib import Path
 from rigidmd.core.files import write_text
 from rigidmd.scene.models import LENNARD_JONES, MoleculeFile, Site
 
-#: Of a file whose sites have no interactions.
-TO_FILL_IN = """# Sites have masses only: they do not act on anything. Give each one what it has of
+#: Head of a file whose sites have no interactions.
+TO_FILL_IN = """# Sites have masses only and do not interact. Add the parameters of each site:
 #   charge_e = -0.1            charge in elementary charges
 #   sigma_A = 3.5              Lennard-Jones diameter
 #   epsilon_kJ_mol = 0.3       well depth, or epsilon_kcal_mol or epsilon_K
-# and say in `source` where the numbers are from.
+# and the source of the numbers in `source`.
 """
 
 
 def write_model(path: Path, model: MoleculeFile) -> None:
-    """Write a model; it reads back to the same bits. Raises OutputError."""
+    """Write a model, which is read back to the same bits. Raises OutputError."""
     write_text(path, model_text(model))
 
 
@@ -36,11 +36,11 @@ def _site(site: Site) -> str:
     for key in ("mass_u", "position_A", "charge_e", *LENNARD_JONES):
         value = getattr(site, key)
         if value is not None:
-            told = f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
-            lines.append(f"{key} = {told}")
+            text = f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
+            lines.append(f"{key} = {text}")
     if site.parameters:
-        told = ", ".join(f"{_text(name)} = {value!r}" for name, value in site.parameters.items())
-        lines.append(f"parameters = {{ {told} }}")
+        items = ", ".join(f"{_text(name)} = {value!r}" for name, value in site.parameters.items())
+        lines.append(f"parameters = {{ {items} }}")
     return "\n".join(lines)
 
 

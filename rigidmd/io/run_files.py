@@ -1,4 +1,4 @@
-"""Reading back what runs write. Folders of runs are data of strangers: files are read within bounds, and validated."""
+"""Readers of the JSON and CSV files of runs. They may be from strangers, so sizes are limited and data validated."""
 
 import csv
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError
 from rigidmd.scene.validation import Flag, Number, validation_messages
 
-#: Bytes of a file of JSON or CSV; characters of a line of CSV; absolute value of a number.
+#: Limits: bytes of a JSON file and of a CSV file, characters of a line of CSV, absolute value of a number.
 LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
 
 T = TypeVar("T")
@@ -22,7 +22,7 @@ Bounded = Annotated[Number, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 
 
 class StageSummary(BaseModel):
-    """A stage in summary.json, as far as it is read."""
+    """The part of a stage in summary.json that is read."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -39,7 +39,7 @@ class StageSummary(BaseModel):
 
 
 class Summary(BaseModel):
-    """summary.json, as far as it is read; of molecules and of bodies, by any version."""
+    """The part of summary.json that is read, for molecules and bodies, by any version."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -68,9 +68,9 @@ class Summary(BaseModel):
 
 
 def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
-    """The contents of a file of JSON, validated; None without one. Raises OutputError with file and field.
+    """The validated content of a JSON file; None without a file. Raises OutputError with file and field.
 
-    remedy : what to do if it is damaged
+    remedy : advice for a damaged file
     """
     if not _is_there(path, LARGEST_JSON):
         return None
@@ -96,7 +96,7 @@ def _adapter(kind: Any) -> TypeAdapter:
 
 
 def _is_there(path: Path, largest: float) -> bool:
-    """Whether there is a file. Raises OutputError for what is no file, or larger."""
+    """Whether a file exists. Raises OutputError for a folder or device, and for a file larger than `largest`."""
     if not path.exists() and not path.is_symlink():
         return False
     if fault := unreadable_reason(path, largest):
@@ -107,25 +107,25 @@ def _is_there(path: Path, largest: float) -> bool:
 
 
 class Columns(NamedTuple):
-    """A file of CSV: header -> cells of all whole lines."""
+    """A CSV file: header -> cells of all complete lines."""
 
     path: Path
     cells: dict[str, list[str]]
 
     def numbers(self, header: str, finite: bool = False) -> np.ndarray:
-        """A column as numbers; what is empty is NaN, unless all must be finite. Raises OutputError."""
+        """A column as numbers. An empty cell is NaN, or an error if all must be `finite`. Raises OutputError."""
         try:
             found = np.array([float(cell or "nan") for cell in self.cells[header]])
         except ValueError:
-            raise OutputError(f"{self.path}: column {header!r} holds what is no number") from None
+            raise OutputError(f"{self.path}: column {header!r} has a cell that is not a number") from None
         empty = np.array([not cell for cell in self.cells[header]], bool)
         if not ((np.abs(found) <= LARGEST_NUMBER) | (empty & (not finite))).all():
-            raise OutputError(f"{self.path}: column {header!r} holds what is no finite number below 1e100")
+            raise OutputError(f"{self.path}: column {header!r} has a cell that is not a finite number below 1e100")
         return found
 
 
 def read_columns(path: Path) -> Columns | None:
-    """A file of CSV; None without one. A last line that is cut off is left out. Raises OutputError."""
+    """A CSV file; None without a file. An incomplete last line is left out. Raises OutputError."""
     if not _is_there(path, LARGEST_TABLE):
         return None
     try:
@@ -141,7 +141,7 @@ def read_columns(path: Path) -> Columns | None:
 
 
 def _lines(file: Any) -> Iterator[str]:
-    """The whole lines of a file. Raises csv.Error for one without end."""
+    """The complete lines of a file. Raises csv.Error for a line that is too long."""
     while line := file.readline(LONGEST_LINE):
         if line.endswith("\n"):
             yield line

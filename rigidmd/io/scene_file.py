@@ -1,4 +1,4 @@
-"""The scene in the folder of a run, with all defaults and copies of its input files, so that it can run again."""
+"""The scene in the folder of a run, with all defaults and copies of its input files, so that it can be run again."""
 
 import re
 import shutil
@@ -14,7 +14,7 @@ from rigidmd.scene.molecules import STRUCTURE_NAME
 
 
 def input_names(scene: Scene) -> dict[str, str]:
-    """Names for the copies of a scene's input files: dotted key -> unique name. A copy keeps its name."""
+    """Names of the copies of a scene's input files: dotted key -> unique name. Copies of copies keep their names."""
     names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE_NAME)
     starts = {key: f"input_{re.sub(r'[.](file|module)$|^molecules[.]', '', key)}_" for key in names}
     return {key: starts[key] + name.removeprefix(starts[key]) for key, name in names.items()}

@@ -1,4 +1,4 @@
-"""Trajectories and topology files as a run writes them, through MDAnalysis."""
+"""Writers of the trajectories and topology files of a run."""
 
 import contextlib
 import os
@@ -13,19 +13,19 @@ import MDAnalysis as mda
 import numpy as np
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 
-from rigidmd.core.files import AppendedFile, whole_file
-from rigidmd.core.process import quiet
+from rigidmd.core.files import AppendedFile, atomic_file
+from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.io.formats.gsd_writer import GsdFile
-from rigidmd.io.formats.traj_writer import TrajFile
+from rigidmd.io.formats.gsd import GsdFile
+from rigidmd.io.formats.traj import TrajFile
 from rigidmd.io.trajectory import dimensions, set_frame, universe
 from rigidmd.io.write import writing
 
 NM_PER_A, XTC_PER_NM = 0.1, 1000.0
-#: Least and largest coordinate (Å) of a format, from 32-bit integers of 0.001 nm or columns of text.
+#: Smallest and largest coordinate (Å) of a format, due to 32-bit integers of 0.001 nm or to columns of text.
 LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 9999.99)}
 
 
@@ -37,21 +37,21 @@ def open_trajectory(
     wrapped: bool,
     kept: Sequence[int] | None = None,
 ) -> "TrajectoryFile | GsdFile | TrajFile":
-    """The file that frames go to, which the ending chooses; for the arguments see `TrajectoryFile`."""
+    """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
     if (kind := {".gsd": GsdFile, ".traj": TrajFile}.get(path.suffix)) is not None:
         if not isinstance(system, System):
-            raise TypeError(f"a {path.suffix} file is of molecules")
+            raise TypeError(f"{path.suffix} files are for molecules only")
         return kind(path, system, velocities, wrapped, kept)
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Write names, molecules and first positions, which viewers need beside a trajectory.
+    """Write names, molecules and first positions, which viewers need next to a trajectory.
 
     Raises SimulationError if the format cannot hold a position.
     """
     _check_fits(path, system.site_positions(state, wrapped))
-    with whole_file(path) as temporary, quiet():  # of missing attributes (occupancies, ...)
+    with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
         sites = universe(system, state, wrapped=wrapped).select_atoms("all")
         sites.write(str(temporary), **({"bonds": "all"} if path.suffix == ".pdb" else {}))
 
@@ -67,13 +67,13 @@ def _check_fits(path: Path, positions: np.ndarray) -> None:
 
 
 class TrajectoryFile:
-    """Writes frames to a file as they come. The ending sets the format.
+    """Writes frames to a trajectory, in the format of the file's extension.
 
-    MDAnalysis writes each frame to a file of its own in memory; its bytes go to the end of the trajectory. So every
-    write is checked, a file that ends early ends with a whole frame, and a run can go on with the file of another.
+    MDAnalysis writes each frame to a separate file in memory, whose bytes are appended to the trajectory. So every
+    write is checked, a killed run leaves whole frames, and a resumed run can continue the file.
 
-    interval : time between frames (ps); only .dcd uses it, which stores it once for all frames
-    kept : `kept` of an earlier time, at which an existing file is continued after `cut`; None begins a new file
+    interval : time between frames (ps), for .dcd, which stores it once for all frames
+    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a new file
     Raises OutputError, here and in every method.
     """
 
@@ -92,7 +92,7 @@ class TrajectoryFile:
         forms = {
             ".dcd": {"dt": interval},
             ".nc": {"velocities": velocities},
-            ".pdb": {"multiframe": True, "bonds": None},  # those of the topology do
+            ".pdb": {"multiframe": True, "bonds": None},  # bonds are in the topology
         }
         self._options = forms.get(path.suffix, {})
         *before, self._frames = kept or (0, 0, 0)
@@ -102,20 +102,20 @@ class TrajectoryFile:
 
     @property
     def kept(self) -> tuple[int, int, int]:
-        """Bytes so far, all of them on the disk, their checksum, and the number of frames."""
+        """Number of bytes, all on the disk, their checksum, and the number of frames."""
         return *self._file.kept, self._frames
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
-        if self._format in (".xtc", ".trr"):  # as GROMACS does: 32 bits of the step, the time is what counts
+        if self._format in (".xtc", ".trr"):  # as GROMACS, which has 32 bits of the step
             step = (step + 2**31) % 2**32 - 2**31
-        with writing(self._path):  # the file of a frame may find no room in memory
+        with writing(self._path):  # memory for the file of a frame may be insufficient
             if self._format == ".xtc":
                 piece = self._xtc_frame(state, time, step)
             else:
                 set_frame(self._universe, self._system, state, time, step, self._velocities, self._wrapped)
                 _check_fits(self._path, self._universe.trajectory.ts.positions)
-                piece = self._part_of(self._whole(state, time))
+                piece = self._part_to_append(self._file_of_frame(state, time))
         self._file.append(piece)
         self._frames += 1
         if self._format in COUNTER:
@@ -123,15 +123,14 @@ class TrajectoryFile:
             self._file.patch(offset, struct.pack(form, self._frames))
 
     def cut(self) -> None:
-        """Cut off the frames that came after the time of `kept`."""
+        """Leave out the frames after the checkpoint."""
         self._file.cut()
 
     def close(self) -> None:
-        """Finish the file."""
         self._file.close()
 
     def _xtc_frame(self, state: State, time: float, step: int) -> bytes:
-        """A frame of the most usual format, as MDAnalysis' writer makes it, in half of the time."""
+        """A frame of .xtc with the same bytes as from MDAnalysis' writer, in half the time."""
         positions = self._system.site_positions(state, self._wrapped).astype(np.float32)
         _check_fits(self._path, positions)
         positions *= NM_PER_A
@@ -141,10 +140,10 @@ class TrajectoryFile:
                 file.write(positions, box.astype(np.float32), step, time, XTC_PER_NM)
             return _content(path)
 
-    def _whole(self, state: State, time: float) -> bytes:
-        """The file that has the present frame alone."""
+    def _file_of_frame(self, state: State, time: float) -> bytes:
+        """The content of a file with only the present frame."""
         options = self._options | ({"start": self._frames} if self._format == ".pdb" else {})
-        with _scratch(self._path) as path, quiet():
+        with _scratch(self._path) as path, ignore_warnings():
             form = "NCDF" if self._format == ".nc" else self._format[1:].upper()
             writer: Any = mda.Writer(path, n_atoms=len(self._system.sites.name), format=form, **options)
             with writer:
@@ -157,11 +156,11 @@ class TrajectoryFile:
                     writer.CRYST1(box)
             return _content(path)
 
-    def _part_of(self, whole: bytes) -> bytes:
-        """What is added to the trajectory: the frame, before the first one with the head of the file."""
+    def _part_to_append(self, whole: bytes) -> bytes:
+        """The bytes to append: the frame, and before the first frame the head of the file."""
         n, first = len(self._system.sites.name), self._frames == 0
         if self._format == ".pdb":
-            # the time, the box, the model; no END, which readers take for the end of a further frame
+            # the time, the box, the model, but no END, which readers count as a further frame
             lines = whole.removesuffix(b"END\n").splitlines(keepends=True)
             model = next(k for k, line in enumerate(lines) if line.startswith(b"MODEL "))
             box = [line for line in lines[-1:] if line.startswith(b"CRYST1")]
@@ -176,13 +175,13 @@ class TrajectoryFile:
         return whole[-size:]
 
 
-#: Where a format counts its frames: offset and how the number is packed.
+#: Position of the number of frames in a file: offset and `struct` format.
 COUNTER = {".dcd": (8, "<i"), ".nc": (4, ">i")}
 
 
 @contextlib.contextmanager
 def _scratch(path: Path) -> Iterator[str]:
-    """A path to write one frame to: in memory on Linux, elsewhere a hidden file beside the trajectory."""
+    """A path for the file of a frame: in memory on Linux, elsewhere a hidden file next to the trajectory."""
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create(path.name)
         try:
@@ -200,7 +199,7 @@ def _content(path: str) -> bytes:
 
 
 def _extended_xyz(cell: np.ndarray, time: float) -> str:
-    """Comment line of extended XYZ, which OVITO and ASE read: box and time."""
+    """The comment line of extended XYZ (for OVITO and ASE): box and time."""
     box = 'pbc="F F F"'
     if cell[0, 0] < inf:
         edges = " ".join(f"{x:.9g}" for x in cell.flat)

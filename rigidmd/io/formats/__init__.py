@@ -1,1 +1,1 @@
-"""One module per file format, or per library that reads several."""
+"""One module per file format, or per library that reads several formats."""

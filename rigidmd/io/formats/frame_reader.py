@@ -1,9 +1,9 @@
-"""Reads a frame of a trajectory by MDAnalysis, as a program of its own: PATH FRAME ATOMS TARGET.
+"""A program that reads a frame of a trajectory by MDAnalysis. Its arguments are PATH FRAME ATOMS TARGET.
 
-The C code that reads these formats crashes on damaged files, and such a crash must not end a run. TARGET, an .npz, gets
-`fault`, or position (n, 3) in Å and, where the file has them, velocity (n, 3) in Å/ps and cell (3, 3) in Å. FRAME is 1
-for the first and -1 for the last; with 0 all frames of an .xtc are tried, and TARGET gets their `count`. ATOMS is the
-number of atoms that there must be.
+It is a separate process, because the C code that reads these formats crashes on damaged files. FRAME is 1 for the first
+and -1 for the last frame; 0 tries all frames of an .xtc. ATOMS is the required number of atoms. TARGET is the .npz file
+of the results: position (n, 3) in Å, and velocity (n, 3) in Å/ps and cell (3, 3) in Å if the file has them; `count`
+for FRAME 0; or `error`, a message.
 """
 
 import sys
@@ -16,14 +16,14 @@ NM = 10.0  # Å
 
 
 def read(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """The arrays of a frame. Raises whatever the readers do."""
+    """The arrays of a frame. Raises the exceptions of the readers."""
     if frame == 0:
         return _tried(path)
     return {".xtc": _gromacs, ".trr": _gromacs}.get(Path(path).suffix.lower(), _others)(path, frame, atoms)
 
 
 def _gromacs(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """XTC and TRR, by the library beneath MDAnalysis' readers, which leave files with offsets beside a trajectory."""
+    """XTC and TRR, by the library of MDAnalysis' readers, which themselves write files with offsets."""
     from MDAnalysis.lib.formats.libmdaxdr import TRRFile, XTCFile
 
     with (XTCFile if path.lower().endswith(".xtc") else TRRFile)(path) as file:
@@ -41,7 +41,7 @@ def _gromacs(path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
 
 
 def _tried(path: str) -> dict[str, np.ndarray]:
-    """How many frames of an .xtc can be read."""
+    """The number of readable frames of an .xtc."""
     from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 
     count = 0
@@ -49,7 +49,7 @@ def _tried(path: str) -> dict[str, np.ndarray]:
         try:
             for _ in file:
                 count += 1
-        except OSError:  # it ends within a frame
+        except OSError:  # the file ends within a frame
             pass
     return {"count": np.array(count)}
 
@@ -82,12 +82,11 @@ def _index(count: int, frame: int) -> int:
 
 
 def main(path: str, frame: str, atoms: str, target: str) -> None:
-    """The program."""
     warnings.simplefilter("ignore")
     try:
         found = {name: values.astype(float) for name, values in read(path, int(frame), int(atoms)).items()}
     except Exception as error:  # many types, from OSError to MemoryError
-        found = {"fault": np.array(" ".join(str(error).split()) or type(error).__name__)}
+        found = {"error": np.array(" ".join(str(error).split()) or type(error).__name__)}
     np.savez(target, **found)  # pyright: ignore[reportArgumentType]
 
 

@@ -1,12 +1,15 @@
-"""GSD, the format of HOOMD: a rigid body is a central particle, which turns, with constituent particles.
+"""GSD, the format of HOOMD: trajectories of molecules with rotations and angular momenta.
 
-In a file the box lies about the origin and every particle in it, with the number of its image; here the box begins at
-the origin, and positions are those of the images. A file is read chunk by chunk: sizes that it promises are compared
-with what it holds before anything is made of them.
+A molecule of several sites is a rigid body as in HOOMD: a central particle with mass, moments of inertia, orientation
+and angular momentum, and its sites as constituent particles. A molecule of one site is a free particle. In a file the
+box is centred at the origin and particles are wrapped, with their image numbers; here the box begins at the origin and
+positions are unwrapped. Files are read chunk by chunk, and sizes are checked before arrays are allocated.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import contextlib
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -14,22 +17,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.mechanics.rotation import from_quaternion
+from rigidmd.core.files import atomic_file, create_empty_file
+from rigidmd.core.state import State
+from rigidmd.engines.system import System
+from rigidmd.errors import OutputError
+from rigidmd.io.bonds import charges, connections
+from rigidmd.io.formats.frame_file import FrameFile, reason_of
+from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
+from rigidmd.scene.models import gather_per_molecule
 
-#: Time of a frame, ps, for which the schema has no place of its own.
+#: Logged quantity with the time of a frame, ps, which the schema lacks.
 TIME = "time_ps"
 
 
 class Particles(NamedTuple):
-    """The N particles of a frame, in the units of the file; rigidmd writes Å, ps, u and e."""
+    """The N particles of a frame, in the units of the file. rigidmd writes Å, ps, u and e."""
 
     step: int
-    time: float  # ps; NaN where the file does not tell it
+    time: float  # ps; NaN if the file does not have it
     cell: np.ndarray | None  # (3, 3) rows a, b, c
     label: list[str]  # (N,) names of types
-    owner: np.ndarray  # (N,) the central particle of the body that a particle is part of; itself where there is none
-    position: np.ndarray  # (N, 3) lab frame, a molecule is whole
-    orientation: np.ndarray  # (N, 4) wxyz, of length 1
+    owner: np.ndarray  # (N,) index of the central particle of the body; of the particle itself without a body
+    position: np.ndarray  # (N, 3) lab frame, molecules whole
+    orientation: np.ndarray  # (N, 4) wxyz, normalised
     velocity: np.ndarray | None  # (N, 3)
     angular_momentum_body: np.ndarray  # (N, 3)
     inertia: np.ndarray  # (N, 3)
@@ -37,12 +47,12 @@ class Particles(NamedTuple):
 
     @property
     def centres(self) -> np.ndarray:
-        """Central particles and those without a body: one for each molecule."""
+        """Indices of central particles and particles without a body: one for each molecule."""
         return np.flatnonzero(self.owner == np.arange(len(self.owner)))
 
     @property
     def sites(self) -> np.ndarray:
-        """All but the central particles of bodies, molecule by molecule."""
+        """Indices of all particles except the central ones of bodies, molecule by molecule."""
         size = np.bincount(self.owner, minlength=len(self.owner))
         order = np.argsort(self.owner, kind="stable")
         return order[(self.owner[order] != order) | (size[order] == 1)]
@@ -52,7 +62,7 @@ class Particles(NamedTuple):
         return from_quaternion(self.orientation[self.centres])
 
     def site_velocities(self) -> np.ndarray | None:
-        """Velocities of the sites, those of rigid bodies: HOOMD does not keep those of constituents."""
+        """Velocities of the sites, from the rigid bodies, because HOOMD stores none of constituents."""
         if self.velocity is None:
             return None
         inverse = np.divide(1.0, self.inertia, out=np.zeros_like(self.inertia), where=self.inertia > 0)
@@ -63,10 +73,7 @@ class Particles(NamedTuple):
 
 
 class GsdReader:
-    """Reads the frames of a file. Its methods raise OSError or ValueError for what cannot be read.
-
-    count : frames
-    """
+    """Reads the frames of a file. Methods raise OSError or ValueError. `count` is the number of frames."""
 
     def __init__(self, path: Path):
         import gsd.fl
@@ -82,7 +89,6 @@ class GsdReader:
         self._file.close()
 
     def size(self, frame: int) -> int:
-        """Number of particles in a frame."""
         found = self._chunk(frame, "particles/N")
         return 0 if found is None else int(found.flat[0])
 
@@ -95,10 +101,10 @@ class GsdReader:
         of = partial(self._of_particles, frame, n)
         types, kind = self._types(frame), of("typeid", (), 0).astype(int)
         if not 0 <= kind.min() <= kind.max() < len(types):
-            raise ValueError(f"frame {frame + 1} has a particle of no type")
-        body, own = of("body", (), -1).astype(np.int32).astype(int), np.arange(n)  # -1 is often stored unsigned
+            raise ValueError(f"frame {frame + 1} has a particle without a type")
+        body = of("body", (), -1).astype(np.int32).astype(int)  # -1 is often stored unsigned
         if body.max() >= n:
-            raise ValueError(f"frame {frame + 1} has a particle of a body that is not there")
+            raise ValueError(f"frame {frame + 1} has a particle of a body that does not exist")
         cell = self._cell(frame)
         position = position.astype(float)
         if cell is not None:
@@ -106,26 +112,21 @@ class GsdReader:
         orientation = of("orientation", (4,), (1, 0, 0, 0)).astype(float)
         length = np.linalg.norm(orientation, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise ValueError(f"frame {frame + 1} has an orientation that is none")
+            raise ValueError(f"frame {frame + 1} has an orientation of length 0")
         orientation /= length
         step, time = self._chunk(frame, "configuration/step"), self._chunk(frame, f"log/{TIME}")
         moving = self._chunk(frame, "particles/velocity") is not None
         return Particles(
             step=0 if step is None else int(step.flat[0]),
-            time=nan if time is None or time.size != 1 else float(time.flat[0]),
-            cell=cell,
-            label=[types[k] for k in kind],
-            owner=np.where(body < 0, own, body),
-            position=position,
-            orientation=orientation,
-            velocity=of("velocity", (3,), 0).astype(float) if moving else None,
+            time=nan if time is None or time.size != 1 else float(time.flat[0]), cell=cell,
+            label=[types[k] for k in kind], owner=np.where(body < 0, np.arange(n), body), position=position,
+            orientation=orientation, velocity=of("velocity", (3,), 0).astype(float) if moving else None,
             angular_momentum_body=_vector_part(orientation, of("angmom", (4,), 0).astype(float)),
-            inertia=of("moment_inertia", (3,), 0).astype(float),
-            mass=of("mass", (), 1).astype(float),
-        )
+            inertia=of("moment_inertia", (3,), 0).astype(float), mass=of("mass", (), 1).astype(float),
+        )  # fmt: skip
 
     def _chunk(self, frame: int, name: str) -> np.ndarray | None:
-        """A chunk of a frame, else of the first frame, as the schema says; None without either."""
+        """A chunk of a frame, else of the first frame (see the schema); None without either."""
         with _refusals():
             for k in (frame, 0):
                 if self._file.chunk_exists(frame=k, name=name):
@@ -144,9 +145,9 @@ class GsdReader:
     def _types(self, frame: int) -> list[str]:
         found = self._chunk(frame, "particles/types")
         if found is None:
-            return ["A"]  # of the schema
+            return ["A"]  # default of the schema
         if found.ndim != 2 or found.dtype.itemsize != 1:
-            raise ValueError("its names of types are no text")
+            raise ValueError("its names of types are not text")
         return [row.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace") for row in found]
 
     def _cell(self, frame: int) -> np.ndarray | None:
@@ -160,7 +161,7 @@ class GsdReader:
 
 
 def box_of(cell: np.ndarray) -> list[float]:
-    """Edges along the axes and tilts, as a file holds a cell (3, 3); all 0 without one."""
+    """A cell (3, 3) as edges along the axes and tilts; all 0 without a cell."""
     if not np.isfinite(cell).all():
         return [0.0] * 6
     (lx, _, _), (bx, ly, _), (cx, cy, lz) = cell
@@ -180,10 +181,172 @@ def _vector_part(orientation: np.ndarray, momentum: np.ndarray) -> np.ndarray:
     return (w * momentum[:, 1:] + momentum[:, :1] * v + np.cross(v, momentum[:, 1:])) / 2
 
 
-@contextmanager
+@contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Refusals of the library, which makes room before it looks at the size of the file, as ValueError."""
+    """Within it, errors of the library become ValueError; it allocates arrays before it checks the size of the file."""
     try:
         yield
     except (RuntimeError, KeyError, MemoryError) as error:
         raise ValueError(" ".join(str(error).split())) from None
+
+
+#: Diameter, Å, of central particles in viewers.
+DOT = 0.1
+#: Properties that change from frame to frame, and their types in the file.
+POSITIONS = {"position": np.float32, "image": np.int32, "orientation": np.float32}
+MOMENTA = {"velocity": np.float32, "angmom": np.float32}
+
+
+class GsdFile(FrameFile):
+    """Writes GSD files."""
+
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+        super().__init__(path, system, velocities, wrapped, kept)
+        self._changing = POSITIONS | MOMENTA if velocities else POSITIONS
+        self._set_layout()
+        if kept is not None:
+            for _ in self._kept_frames():
+                pass
+            return
+        with _writing(path):
+            create_empty_file(path)
+            self._file = _open(path, "w")
+
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        frame = self._frame(state, time, step)
+        with _writing(self._path):
+            self._append(self._file, frame)
+        self._sum, self._frames = self._summed(frame), self._frames + 1
+
+    def cut(self) -> None:
+        """Leave out the frames after the checkpoint."""
+        with _writing(self._path):
+            with atomic_file(self._path) as temporary, _open(temporary, "w") as new:
+                for frame in self._kept_frames():
+                    self._append(new, frame)
+            self._file = _open(self._path, "r+")
+
+    @staticmethod
+    def _append(file: Any, frame: Any) -> None:
+        file.append(frame)
+        file.file.flush()  # after every frame, so that offsets of chunks do not depend on the time of a flush
+
+    def _stored_frames(self, count: int) -> Iterator[Any]:
+        with contextlib.closing(GsdReader(self._path)) as reader:
+            particles = len(self._constant["mass"])
+            if reader.count < count or not {reader.size(k) for k in range(count)} <= {particles}:
+                raise ValueError(f"{count} frames of {particles} particles are needed")
+        with _open(self._path, "r") as old:
+            for k in range(count):
+                yield old[k]
+
+    def _set_layout(self) -> None:
+        """Set the constant properties. Particles are molecules, then the sites of molecules with several sites."""
+        system = self._system
+        molecule, species = system.sites.molecule, system.model.species
+        single = np.bincount(molecule) == 1
+        n = len(single)
+        constituent = ~single[molecule]
+        self._constituent = np.flatnonzero(constituent)
+        particle = np.where(constituent, n + np.cumsum(constituent) - 1, molecule)  # of each site
+        site_labels = self._labels()
+        names = [m.name if m.name not in site_labels else f"{m.name}_body" for m in system.species]
+        label = np.array([names[k] for k in species] + [""] * len(self._constituent), dtype=object)
+        label[particle] = site_labels
+        types = list(dict.fromkeys(label.tolist()))
+        mass = np.array([m.mass for m in system.species])[species]
+        moments = np.array([m.inertia for m in system.species])[species]
+        charge = np.zeros(len(label))
+        charge[particle] = charges(system)
+        central = set(label[:n][~single])
+        self._constant: dict[str, Any] = {
+            "types": types, "typeid": np.array([types.index(name) for name in label]),
+            "type_shapes": [{"type": "Sphere", "diameter": DOT} if name in central else {} for name in types],
+            "body": np.concatenate([np.where(single, -1, np.arange(n)), molecule[constituent]]),
+            "mass": np.concatenate([mass, system.sites.mass[constituent]]), "charge": charge,
+            "moment_inertia": np.vstack([moments, np.zeros((len(self._constituent), 3))]),
+        }  # fmt: skip
+        self._bonds = particle[connections(system)]
+
+    def _labels(self) -> np.ndarray:
+        """Type of each site (s,): its element, or its name without element, with the species if it is ambiguous."""
+        names, of_scene, of_species = [], defaultdict(set), defaultdict(set)
+        for m in self._system.species:
+            names.append([name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)])
+            for name, *kind in zip(names[-1], m.masses, m.charges, m.sigma, m.epsilon, strict=True):
+                of_scene[name].add(tuple(kind))
+                of_species[m.name, name].add(tuple(kind))
+
+        def label(species: str, name: str, site: str) -> str:
+            if len(of_scene[name]) == 1:
+                return name
+            return f"{species}.{name if len(of_species[species, name]) == 1 else site}"
+
+        labels = [
+            np.array([label(m.name, *both) for both in zip(of_sites, m.site_names, strict=True)], dtype=object)
+            for m, of_sites in zip(self._system.species, names, strict=True)
+        ]
+        return gather_per_molecule(labels, self._system.model.species)
+
+    def _frame(self, state: State, time: float, step: int) -> Any:
+        system, sites = self._system, self._constituent
+        owner, n = system.sites.molecule[sites], len(state.position)
+        orientation = to_quaternion(state.rotation) if len(state.rotation) else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        where = np.vstack([system.centres(state, self._wrapped), system.site_positions(state, self._wrapped)[sites]])
+        position, image = _inside(state.cell, where)
+        found = {"position": position, "image": image}
+        found["orientation"] = np.vstack([orientation, orientation[owner]])
+        if self._velocities:
+            found["velocity"] = np.vstack([state.velocity, system.site_velocities(state)[sites]])
+            momentum = np.zeros((n + len(sites), 4))
+            if len(state.rotation):
+                momentum[:n] = momentum_quaternion(orientation, state.angular_momentum_body)
+            found["angmom"] = momentum
+        import gsd.hoomd
+
+        frame: Any = gsd.hoomd.Frame()
+        frame.configuration.step = step
+        frame.configuration.dimensions = 3
+        frame.configuration.box = np.array(box_of(state.cell), np.float32)
+        frame.log[TIME] = np.array([time])
+        frame.particles.N, frame.bonds.N = len(where), len(self._bonds)
+        for name, values in found.items():
+            # in the type of the file, because the library compares it with the first frame and leaves equal chunks out
+            setattr(frame.particles, name, values.astype(self._changing[name]))
+        if self._frames == 0:
+            for name, values in self._constant.items():
+                setattr(frame.particles, name, values)
+            frame.bonds.types, frame.bonds.group = ["bond"], self._bonds
+            frame.bonds.typeid = np.zeros(len(self._bonds), int)
+        return frame
+
+    def _summed(self, frame: Any) -> int:
+        found = zlib.crc32(np.asarray(frame.configuration.box, np.float32).tobytes(), self._sum)
+        found = zlib.crc32(np.asarray(frame.log[TIME], float).tobytes(), found)
+        for name, kind in self._changing.items():
+            found = zlib.crc32(np.ascontiguousarray(getattr(frame.particles, name), kind).tobytes(), found)
+        return found
+
+
+def _open(path: Path, mode: Any) -> Any:
+    import gsd.hoomd  # slow to import
+
+    return gsd.hoomd.open(str(path), mode)
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Within it, errors of the library become OutputError."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{path} cannot be written: {reason_of(error)}") from None
+
+
+def _inside(cell: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) in the box that is centred at the origin, and their image numbers (N, 3)."""
+    if not np.isfinite(cell).all():
+        return position, np.zeros(position.shape, np.int32)
+    image = np.floor(np.linalg.solve(cell.T, position.T).T)
+    return position - (image + 0.5) @ cell, image.astype(np.int32)

@@ -1,4 +1,4 @@
-"""LAMMPS' data files and text dumps: atoms have types, which labels, masses or the scene name."""
+"""Readers of LAMMPS' data files and text dumps. Atoms have types, which get names from labels, masses or the scene."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.toml import whole_number
+from rigidmd.core.toml import parse_whole_number
 from rigidmd.engines.lammps.dump import box_in_bounds
 from rigidmd.errors import StructureError
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element
-from rigidmd.io.formats.text import numbers, promised_atoms, table
+from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element, structure_error
+from rigidmd.io.formats.text import atom_count, numbers, table, unexpected
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
-#: Columns of the section Atoms by atom style; three image numbers may follow. Numbers that are not used are a, b, c.
+#: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns that are not used.
 STYLES = {
     style: columns.split()
     for columns, styles in {
@@ -32,12 +32,12 @@ STYLES = {
     }.items()
     for style in styles.split()
 }
-#: Styles by which a section Atoms without a style is read, where only one of them fits.
+#: Styles that a section Atoms without a style may have, if exactly one of them fits.
 GUESSED = ("atomic", "charge", "molecular", "full")
 #: Names of columns in a comment after Atoms.
 COLUMN = {"atom-id": "id", "mol-id": "mol", "molecule-id": "mol", "molecule": "mol", "atom-type": "type", "charge": "q"}
 UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
-#: Coordinates in a dump: as they are, unwrapped, and both in units of the edges.
+#: Columns of coordinates in a dump: wrapped, unwrapped, and both in units of the edges.
 COORDINATES = (("x", "y", "z"), ("xs", "ys", "zs"), ("xu", "yu", "zu"), ("xsu", "ysu", "zsu"))
 
 
@@ -50,16 +50,15 @@ class Row(NamedTuple):
 
 
 def read_data(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """The structure of a data file. The first line may name the units; real and metal differ only in velocities."""
+    """The structure of a data file. The first line may name the units. Real and metal differ only in velocities."""
     head, styles, sections = _sections(lines)
     found = [row for row in head if row.words[1:] == ["atoms"]]
     if not found:
-        raise StructureError(str(path), ["has no line with the number of atoms before its sections, such as '3 atoms'"])
+        raise structure_error(path, "has no line with the number of atoms before its sections, such as '3 atoms'")
     rows = sections.get("Atoms", [])
-    count = promised_atoms(path, found[0].line, found[0].words[0], len(rows))
+    count = atom_count(path, found[0].line, found[0].words[0], len(rows))
     if count != len(rows):
-        told = f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}"
-        raise StructureError(str(path), [told])
+        raise structure_error(path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}")
     return [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)] if rows else []
 
 
@@ -90,15 +89,14 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
         if kind not in names and len(row.comment.split()) == 1:
             names[kind] = row.comment
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
-    numbered = range(1, 1 + min(whole_number(declared) or 0, len(rows)))
+    numbered = range(1, 1 + min(parse_whole_number(declared) or 0, len(rows)))
     known = {*mass_of, *labels, *number_of, *map(str, numbered)}
     column = _columns(path, style, rows, known)
     width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
     for line, words, _ in rows:
-        if len(words) < width or any(whole_number(words[k]) is None for k in whole):
-            told = f"line {line}: expected an atom ({' '.join(column)}), found {' '.join(words)[:60]!r}"
-            raise StructureError(str(path), [told])
-    rows = sorted(rows, key=lambda row: whole_number(row.words[column["id"]]) or 0)
+        if len(words) < width or any(parse_whole_number(words[k]) is None for k in whole):
+            raise unexpected(path, line, f"an atom ({' '.join(column)})", " ".join(words))
+    rows = sorted(rows, key=lambda row: parse_whole_number(row.words[column["id"]]) or 0)
     cell = _box(path, head)
     position = table(path, [(r.line, r.words[column["x"] : column["x"] + 3]) for r in rows], "three coordinates")
     images = [row.words[width : width + 3] for row in rows]
@@ -108,35 +106,28 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
     masses = None
     if mass_of:
         if lacking := sorted({kind for kind in types if kind not in mass_of}):
-            raise StructureError(str(path), [f"its section Masses has no mass of type {', '.join(lacking)}"])
+            raise structure_error(path, f"its section Masses has no mass of type {', '.join(lacking)}")
         masses = np.array([mass_of[kind] for kind in types])
-    elif atom_types is None and all(whole_number(kind) is not None and kind not in names for kind in types):
-        fault = "has no section Masses, from which its atom types could be told: name them by structure.atom_types"
-        raise StructureError(str(path), [fault])
-    elements = [element_of_mass(mass) for mass in mass_of.values()]
-    element = dict(zip(mass_of, elements, strict=True))
+    elif atom_types is None and all(parse_whole_number(kind) is not None and kind not in names for kind in types):
+        hint = "name its atom types by structure.atom_types"
+        raise structure_error(path, f"has no section Masses, and its atom types are unknown: {hint}")
+    element = {kind: element_of_mass(mass) for kind, mass in mass_of.items()}
     found = Atoms(
-        _names(path, types, [*mass_of], names, atom_types),
-        [element.get(kind, "") for kind in types],
-        _residues([row.words[column["mol"]] for row in rows] if "mol" in column else []) or [()] * len(rows),
-        position,
-        None,
-        cell,
-        masses,
-        [],
-    )
+        _names(path, types, [*mass_of], names, atom_types), [element.get(kind, "") for kind in types],
+        _residues([row.words[column["mol"]] for row in rows] if "mol" in column else []) or [()] * len(rows), position,
+        cell=cell, masses=masses,
+    )  # fmt: skip
     moving = {row.words[0]: (row.line, row.words[1:4]) for row in sections.get("Velocities", [])}
     velocity = None
     if moving:
-        none = (0, ["nan"] * 3)
-        given = [moving.get(row.words[column["id"]], none) for row in rows]
+        given = [moving.get(row.words[column["id"]], (0, ["nan"] * 3)) for row in rows]
         velocity = table(path, given, "an atom and its three velocities")
-    return _in_our_units(found, velocity, title, "its first line does not say its units ('units = real')")
+    return _in_our_units(found, velocity, title, "its first line does not name its units ('units = real')")
 
 
 def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[str, int]:
-    """The column of what each atom has: by the style or the names of columns after Atoms, else as the only one that
-    fits. Raises StructureError."""
+    """The columns of the atoms: by the style or the names of columns after Atoms, else by the only style that fits.
+    Raises StructureError."""
     words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
     width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
     if words[0] == "hybrid":
@@ -148,30 +139,24 @@ def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[s
     else:
         fitting = [STYLES[name] for name in GUESSED if _fits(STYLES[name], rows, known)]
         if len(fitting) != 1:
-            raise StructureError(
-                str(path),
-                [
-                    f"line {line}: what the {width} columns of its atoms are is open: write the atom style after the "
-                    f"name of the section, such as 'Atoms # molecular' (known are {', '.join(STYLES)}, hybrid)"
-                ],
-            )
+            hint = f"such as 'Atoms # molecular' (known are {', '.join(STYLES)}, hybrid)"
+            problem = f"line {line}: the meaning of the {width} columns of its atoms is ambiguous"
+            raise structure_error(path, f"{problem}: write the atom style after the name of the section, {hint}")
         [columns] = fitting
     if width - len(columns) not in (0, 3):
-        told = (
-            f"line {line}: an atom of style {style!r} has {len(columns)} columns ({' '.join(columns)}), found {width}"
-        )
-        raise StructureError(str(path), [told])
+        usual = f"{len(columns)} columns ({' '.join(columns)})"
+        raise structure_error(path, f"line {line}: an atom of style {style!r} has {usual}, found {width}")
     return {name: columns.index(name) for name in columns}
 
 
 def _fits(columns: list[str], rows: list[Row], known: set[str]) -> bool:
-    """Whether all rows may have these columns, perhaps with three image numbers after them."""
+    """Whether all rows can have these columns, and three image numbers or nothing after them."""
     kind, whole = columns.index("type"), [k for k, name in enumerate(columns) if name in ("id", "mol")]
     for row in rows:
         words, images = row.words, [word.lstrip("+-") for word in row.words[len(columns) :]]
         if len(words) < len(columns) or len(images) not in (0, 3):
             return False
-        if any(whole_number(word) is None for word in (*images, *(words[k] for k in whole))):
+        if any(parse_whole_number(word) is None for word in (*images, *(words[k] for k in whole))):
             return False
         if words[kind] not in known and not words[kind][0].isalpha():
             return False
@@ -182,14 +167,13 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
     """The cell (3, 3); None without one."""
     by_name = {" ".join(words[k:]): (row.line, words[:k]) for row in head for words in [row.words] for k in (2, 3, 4)}
     if "avec" in by_name:
-        return table(
-            path, [by_name.get(name, (1, [])) for name in ("avec", "bvec", "cvec")], "three components of an edge"
-        )
+        edges = [by_name.get(name, (1, [])) for name in ("avec", "bvec", "cvec")]
+        return table(path, edges, "three components of an edge")
     lines = [f"{x}lo {x}hi" for x in "xyz"]
     if lacking := [line for line in lines if line not in by_name]:
         if any(word.endswith(("lo", "hi")) for row in head for word in row.words):
-            told = f"the bounds of its box are incomplete: before the sections there is no line 'LOW HIGH {lacking[0]}'"
-            raise StructureError(str(path), [told])
+            missing = f"a line 'LOW HIGH {lacking[0]}' is missing before the sections"
+            raise structure_error(path, f"the bounds of its box are incomplete: {missing}")
         return None
     low, high = table(path, [by_name[line] for line in lines], "two bounds of the box").T
     cell = np.diag(high - low)
@@ -199,29 +183,29 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
 
 
 def _names(path: Path, types: list[str], listed: list[str], names: dict[str, str], atom_types) -> list[str]:
-    """The name of each atom: as the scene names its type, else the file, else the type. Raises StructureError."""
+    """The name of each atom: the scene's name of its type, else the file's, else the type. Raises StructureError."""
     if atom_types is None:
         return [names.get(kind, kind) for kind in types]
-    present = sorted({*types, *listed}, key=lambda kind: (whole_number(kind) or 0, kind))
-    asked = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
-    faults = []
-    if unknown := [key for key in atom_types if key not in asked.values()]:
-        faults.append(f"structure.atom_types: there is no type {', '.join(unknown)}; there are {', '.join(present)}")
-    if unnamed := [kind for kind, key in asked.items() if key is None]:
-        faults.append(f"structure.atom_types does not say what type {', '.join(unnamed)} is")
-    if faults:
-        raise StructureError(str(path), faults)
-    return [atom_types[asked[kind]] for kind in types]
+    present = sorted({*types, *listed}, key=lambda kind: (parse_whole_number(kind) or 0, kind))
+    given = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
+    errors = []
+    if unknown := [key for key in atom_types if key not in given.values()]:
+        errors.append(f"structure.atom_types: unknown type {', '.join(unknown)}; there are {', '.join(present)}")
+    if unnamed := [kind for kind, key in given.items() if key is None]:
+        errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
+    if errors:
+        raise StructureError(str(path), errors)
+    return [atom_types[given[kind]] for kind in types]
 
 
 def _residues(numbers_of: Iterable[str]) -> list[tuple]:
-    """Residues of molecule numbers; none where all are 0, which stands for none."""
-    found = [whole_number(number) for number in numbers_of]
+    """Residues from molecule numbers. Empty if all are 0, which stands for no molecules."""
+    found = [parse_whole_number(number) for number in numbers_of]
     return [(number, "") for number in found] if any(found) else []
 
 
 def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown: str) -> Atoms:
-    """Atoms in Å, ps and u. Where the title names no units, lengths are in Å, and velocities are not used."""
+    """Atoms in Å, ps and u. If the title names no units, lengths are in Å and velocities are not used."""
     from ase.calculators.lammps import convert
 
     if (units := UNITS.search(title)) is None:
@@ -233,11 +217,10 @@ def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown
 
     speed = converted(velocity, "velocity")
     return found._replace(
-        position=converted(found.position, "distance"),
-        cell=converted(found.cell, "distance"),
+        position=converted(found.position, "distance"), cell=converted(found.cell, "distance"),
         masses=converted(found.masses, "mass"),
         velocity=None if speed is None else np.where(np.isfinite(speed), speed * ASE_VELOCITY, np.nan),
-    )
+    )  # fmt: skip
 
 
 def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
@@ -251,37 +234,35 @@ def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -
 
 
 def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types) -> Atoms:
-    """The frame in lines that follow line number `first`."""
+    """The frame in the lines after line number `first`."""
     at = {" ".join(line.split()[1:3]): k for k, line in enumerate(lines) if line.startswith("ITEM: ")}
     atoms = next((k for k, line in enumerate(lines) if line.startswith("ITEM: ATOMS")), None)
     if "NUMBER OF" not in at or "BOX BOUNDS" not in at or atoms is None or max(at.values()) + 1 >= len(lines):
-        told = "expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS after it: truncated?"
-        raise StructureError(str(path), [f"line {first + 1}: {told}"])
+        missing = "expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS after it: truncated?"
+        raise structure_error(path, f"line {first + 1}: {missing}")
     line = at["NUMBER OF"] + 1
-    count = promised_atoms(path, first + line + 1, lines[line].strip(), len(lines) - atoms - 1)
+    count = atom_count(path, first + line + 1, lines[line].strip(), len(lines) - atoms - 1)
     columns = {name: k for k, name in enumerate(lines[atoms].split()[2:])}
     rows = [(first + k + 1, lines[k].split()) for k in range(atoms + 1, atoms + 1 + count)]
     if short := [row for row in rows if len(row[1]) < len(columns)]:
         line, words = short[0]
-        told = f"line {line}: expected {len(columns)} columns ({' '.join(columns)}), found {' '.join(words)[:60]!r}"
-        raise StructureError(str(path), [told])
+        raise unexpected(path, line, f"{len(columns)} columns ({' '.join(columns)})", " ".join(words))
 
     def of(*names: str) -> np.ndarray:
-        return table(
-            path, [(number, [words[columns[name]] for name in names]) for number, words in rows], " ".join(names)
-        )
+        values = [(number, [words[columns[name]] for name in names]) for number, words in rows]
+        return table(path, values, " ".join(names))
 
     def texts(name: str) -> list[str]:
         return [words[columns[name]] for _, words in rows]
 
     if "id" in columns:
-        rows.sort(key=lambda row: whole_number(row[1][columns["id"]]) or 0)
+        rows.sort(key=lambda row: parse_whole_number(row[1][columns["id"]]) or 0)
     begin = at["BOX BOUNDS"]
     bounds = [(first + k + 1, lines[k].split()) for k in range(begin + 1, begin + 4)]
     low, cell = _dump_box(path, lines[begin].split()[3:], bounds)
     there = next((names for names in COORDINATES if set(names) <= set(columns)), None)
     if there is None:
-        raise StructureError(str(path), [f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs"])
+        raise structure_error(path, f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs")
     position = of(*there)
     if there[0].startswith("xs"):
         position = low + position @ cell
@@ -297,29 +278,23 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
         elements = [element[mass] for mass in masses.tolist()]
-    if not elements and atom_types is None and all(whole_number(kind) is not None for kind in types):
-        fault = 'has only types of atoms, no elements or masses: name the types by structure.atom_types, { 1 = "O" }'
-        raise StructureError(str(path), [fault])
+    if not elements and atom_types is None and all(parse_whole_number(kind) is not None for kind in types):
+        hint = 'name the types by structure.atom_types, { 1 = "O" }'
+        raise structure_error(path, f"has only types of atoms, no elements or masses: {hint}")
     found = Atoms(
         named if named and atom_types is None else _names(path, types, [], {}, atom_types),
         elements if elements and atom_types is None else [""] * count,
-        _residues(texts("mol") if "mol" in columns else []) or [()] * count,
-        position,
-        None,
-        cell,
-        masses,
-        notes,
-    )
+        _residues(texts("mol") if "mol" in columns else []) or [()] * count, position, None, cell, masses, notes,
+    )  # fmt: skip
     velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
-    return _in_our_units(found, velocity, f"units {units}", "it does not say its units (dump_modify units yes)")
+    return _in_our_units(found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)")
 
 
 def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
     """The origin (3,) and the cell (3, 3) of a dump."""
     bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
-        told = f"line {rows[0][0]}: expected the bounds of the box along x, found {' '.join(rows[0][1])!r}"
-        raise StructureError(str(path), [told])
+        raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))
     if general:
         return bounds[:, 3], bounds[:, :3]
     return box_in_bounds(bounds[:, 0], bounds[:, 1], *(bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)))

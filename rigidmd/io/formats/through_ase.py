@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidmd.core.process import quiet
-from rigidmd.core.toml import whole_number
-from rigidmd.errors import StructureError
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, is_element
-from rigidmd.io.formats.text import numbers, promised_atoms, without_fortran
+from rigidmd.core.process import ignore_warnings
+from rigidmd.core.toml import parse_whole_number
+from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
+from rigidmd.io.formats.text import atom_count, numbers, without_fortran
 
 if TYPE_CHECKING:
     from ase import Atoms as AseAtoms
 
 #: ASE's unit of velocity, sqrt(eV/u), in Å/ps.
 ASE_VELOCITY = 98.22694788464063
-#: Arrays in which ASE keeps names of atoms and their residues, as of .pdb; extended XYZ may have them as columns.
+#: ASE's arrays of names of atoms and residues, as from .pdb. Extended XYZ may have them as columns.
 NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS = "atomtypes", "residuenames", "residuenumbers"
-#: Columns of velocities in extended XYZ that ASE does not convert, as programs differ in their units.
+#: Columns of velocities in extended XYZ that ASE does not convert, because programs use different units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
 
@@ -31,43 +30,38 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
     import ase.io.formats
 
     try:
-        with quiet():
+        with ignore_warnings():
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
-        told = "its format is unknown to ASE; .gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known"
-        raise StructureError(str(path), [told]) from None
+        known = ".gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known formats"
+        raise structure_error(path, f"its format is unknown to ASE; {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
-        why = " ".join(str(error).split()).rstrip(".") or "something is missing or out of place"
-        told = f"ASE, which reads this format, ends with {type(error).__name__}: {why}"
+        reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
         hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
-        raise StructureError(str(path), [f"{told}. {hint}"]) from None
+        message = f"ASE, which reads this format, ends with {type(error).__name__}: {reason}. {hint}"
+        raise structure_error(path, message) from None
     return [atoms for atoms in found if len(atoms)]
 
 
 def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=None, notes=()) -> Atoms:
-    """Atoms from ASE's, in our units. Names and elements that are not given are ASE's symbols."""
+    """Atoms in Å, ps and u from ASE's. By default, names and elements are ASE's symbols."""
     symbols = atoms.get_chemical_symbols()
     notes = list(notes)
     if names is not None and len(names) != len(atoms):
-        raise StructureError(str(path), [f"has {len(names)} atoms, of which ASE reads {len(atoms)}"])
-    shares = {(e, s) for site in (atoms.info.get("occupancy") or {}).values() for e, s in site.items()}
-    if untold := sorted({str(s) for _, s in shares if not (isinstance(s, int | float) and s >= 0)}):
-        raise StructureError(str(path), [f"says of some of its sites that they are occupied by {', '.join(untold)}"])
-    if shares := sorted(f"{e} {s:g}" for e, s in shares if s < 1):
-        raise StructureError(
-            str(path),
-            [
-                f"some of its sites are occupied only partly ({', '.join(shares)}): the crystal is disordered, and "
-                "where the molecules are is open. Give one arrangement of it, in which every site is occupied or left "
-                "out (for ices, GenIce makes proton-disordered ones)"
-            ],
-        )
+        raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
+    occupied = {(e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()}
+    if invalid := sorted({str(x) for _, x in occupied if not (isinstance(x, int | float) and x >= 0)}):
+        raise structure_error(path, f"some of its sites have the occupancy {', '.join(invalid)}")
+    if partial_sites := sorted(f"{e} {x:g}" for e, x in occupied if x < 1):
+        found = f"some of its sites are occupied only partly ({', '.join(partial_sites)}): the crystal is disordered"
+        hint = "in which every site is occupied or left out (for ices, GenIce makes proton-disordered ones)"
+        raise structure_error(path, f"{found}, so that molecules are unknown. Give one arrangement of it, {hint}")
     velocity = atoms.get_velocities() * ASE_VELOCITY if atoms.has("momenta") else None
     if velocity is not None and not np.isfinite(velocity).all():
         bad = int(np.argmin(np.isfinite(velocity).all(axis=1)))
-        raise StructureError(str(path), [f"atom {bad + 1} has a velocity that is not a finite number"])
+        raise structure_error(path, f"atom {bad + 1} has a velocity that is not a finite number")
     if unitless := [key for key in UNITLESS_VELOCITIES if key in atoms.arrays]:
-        notes.append(f"the column {unitless[0]} does not say its units and is not used (ASE writes momenta instead)")
+        notes.append(f"the column {unitless[0]} has no units and is not used (ASE writes momenta instead)")
     cell = None
     if atoms.pbc.all():
         cell = atoms.cell.array.copy()
@@ -75,39 +69,33 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
         axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
         notes.append(f"its cell is periodic along {axes} only and is not used")
     return Atoms(
-        symbols if names is None else names,
-        symbols if elements is None else elements,
-        [()] * len(atoms) if residue is None else residue,
-        atoms.get_positions(),
-        velocity,
-        cell,
-        masses,
-        notes,
-    )
+        symbols if names is None else names, symbols if elements is None else elements,
+        [()] * len(atoms) if residue is None else residue, atoms.get_positions(), velocity, cell, masses, notes,
+    )  # fmt: skip
 
 
 def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
-    """The frames of a plain or extended .xyz through ASE, which needs elements where many files have names.
+    """The frames of a plain or extended .xyz through ASE, which needs elements, while many files have names.
 
-    atom_types : names in place of those in the file, as types of LAMMPS
+    atom_types : name in the file, such as a type of LAMMPS -> name of the atom
     """
     labels, clean, at = [], [], 0
     while at < len(lines):
         if not lines[at].strip():
             at += 1
             continue
-        count = promised_atoms(path, at + 1, lines[at].strip(), len(lines) - at - 2)
+        count = atom_count(path, at + 1, lines[at].strip(), len(lines) - at - 2)
         clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
         properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
         column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
         what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
         lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
         if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
-            raise StructureError(str(path), [f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}"])
+            raise structure_error(path, f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}")
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
             if len(words) < width:
-                raise StructureError(str(path), [f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}"])
+                raise structure_error(path, f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}")
             if place is not None:
                 numbers(path, k + 1, words[place : place + 3], what)
             words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
@@ -120,10 +108,10 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
         at += 2 + count
     frames, first = [], 0
     for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []:
-        own = labels[first : first + len(atoms)]
+        of_frame = labels[first : first + len(atoms)]
         first += len(atoms)
-        named = len(own) == len(atoms) and None not in own
-        names, elements = map(list, zip(*own, strict=True)) if named else (None, None)
+        named = len(of_frame) == len(atoms) and None not in of_frame
+        names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
         if NAMES in atoms.arrays:
             names = [str(name) for name in atoms.arrays[NAMES]]
         masses = atoms.get_masses() if atoms.has("masses") else None
@@ -132,18 +120,18 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
 
 
 def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
-    """Name and element of an atom; its name may be that of a type, or an atomic number."""
+    """Name and element of an atom. The name in the file may be that of a type, or an atomic number."""
     from ase.data import chemical_symbols
 
     name = (atom_types or {}).get(name, name)
-    if (number := whole_number(name)) is not None and 0 < number < len(chemical_symbols):
+    if (number := parse_whole_number(name)) is not None and 0 < number < len(chemical_symbols):
         name = chemical_symbols[number]
     symbol = name.capitalize()
     return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
 
 
 def _residues(atoms) -> list[tuple] | None:
-    """Residues in the arrays that ASE has for them; None without."""
+    """Residues from ASE's arrays of them; None without."""
     if not {RESIDUE_NAMES, RESIDUE_NUMBERS} <= set(atoms.arrays):
         return None
     numbers = atoms.arrays[RESIDUE_NUMBERS]
@@ -153,9 +141,10 @@ def _residues(atoms) -> list[tuple] | None:
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
-    """Columns of the species and the positions, or None, and their number: 0, 1 and 4 of `species:S:1:pos:R:3`."""
+    """Columns of the species and of the positions, or None, and the number of columns: 0, 1 and 4 for
+    `species:S:1:pos:R:3`."""
     words, column, found = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         found["species" if name.lower() == "symbols" else name.lower()] = column
-        column += 1 if (columns := whole_number(width)) is None else columns
+        column += 1 if (columns := parse_whole_number(width)) is None else columns
     return found.get("species"), found.get("pos"), column

@@ -1,31 +1,39 @@
-"""ASE's own trajectories (.traj) as rigidmd writes them: atoms as ASE has them, and what it has no place for.
+"""ASE's trajectory format (.traj). The atoms are the sites with mass.
 
-The atoms are the sites with mass. Arrays of rigidmd's own, which ASE passes by, hold the sites without mass and say
-which sites the atoms are. A file is read item by item; sizes that it promises are compared with what it holds before
-anything is made of them.
+Additional arrays, which ASE ignores, hold massless sites and the indices of the atoms among the sites. Files are read
+item by item, and sizes are checked before arrays are allocated.
 """
 
+import contextlib
+import os
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidmd.core.files import atomic_file, create_empty_file
+from rigidmd.core.state import State
+from rigidmd.engines.system import System
+from rigidmd.io.ase_atoms import atoms_of_sites
+from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
+from rigidmd.io.write import writing
 
-#: What ASE calls such files.
 TAG = "ASE-Trajectory"
-#: Arrays of our own: index of the atoms among the sites, in the first frame; positions and velocities of other sites.
+#: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities of the other sites.
 ATOMS, MASSLESS, MASSLESS_VELOCITY = "rigidmd_atoms", "rigidmd_massless", "rigidmd_massless_velocity"
-#: Bytes of the head of a file: magic number, tag, version, number of items, place of their table.
+#: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
 HEAD = 48
 
 
 class Stored(NamedTuple):
-    """A frame as a file holds it, in Å and ASE's unit of momentum; every array float64."""
+    """A frame of a file, in Å and ASE's unit of momentum; all arrays are float64."""
 
     positions: np.ndarray  # (a, 3) of the atoms
     momenta: np.ndarray | None  # (a, 3)
-    massless: np.ndarray | None  # (m, 3); None where every site has mass
+    massless: np.ndarray | None  # (m, 3); None if all sites have mass
     massless_velocity: np.ndarray | None  # (m, 3) Å/ps
     cell: np.ndarray | None  # (3, 3); None without a box
     time: float  # ps
@@ -33,7 +41,7 @@ class Stored(NamedTuple):
 
 
 class TrajReader:
-    """Reads the frames of a file that rigidmd wrote. Methods raise ValueError or OSError, and nothing else."""
+    """Reads the frames of a file that rigidmd wrote. Methods raise only ValueError or OSError."""
 
     def __init__(self, path: Path):
         from ase.io import ulm
@@ -42,14 +50,14 @@ class TrajReader:
         with path.open("rb") as file:
             head = np.frombuffer(file.read(HEAD)[24:], "<i8")
         if len(head) != 3 or not 0 <= head[1] <= self._size // 8:
-            raise ValueError("it is no trajectory of ASE, or damaged")
+            raise ValueError("not a trajectory of ASE, or damaged")
         try:
             self._file = ulm.Reader(path)
         except (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
             raise ValueError(f"it is damaged: {error}") from None
         try:
             if self._file.get_tag() != TAG:
-                raise ValueError("it is no trajectory of ASE")
+                raise ValueError("not a trajectory of ASE")
             self.count = len(self._file)
             self._atoms = self._array(self._file, ATOMS, (-1,), np.int64) if self.count else np.zeros(0, np.int64)
             self._mass = self._array(self._file, "masses", (len(self._atoms),)) if self.count else np.zeros(0)
@@ -57,8 +65,8 @@ class TrajReader:
             if self.count and MASSLESS in self._file:
                 self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))
             if not np.array_equal(np.unique(self._atoms), self._atoms) or not self._within():
-                raise ValueError("it is damaged: its atoms are no sites")
-        except Exception:  # whatever it is: an object that is not made leaves no file open
+                raise ValueError("it is damaged: its indices of atoms are invalid")
+        except Exception:  # no file stays open
             self.close()
             raise
 
@@ -77,16 +85,13 @@ class TrajReader:
             cell = np.array(item.cell, float)
             info: Any = item.get("info") or {}
             if cell.shape != (3, 3):
-                raise ValueError("it is damaged: a cell is none")
+                raise ValueError("it is damaged: a cell is not of shape (3, 3)")
             return Stored(
-                self._array(item, "positions", atoms),
-                self._array(item, "momenta", atoms) if has["momenta"] else None,
+                self._array(item, "positions", atoms), self._array(item, "momenta", atoms) if has["momenta"] else None,
                 self._array(item, MASSLESS, others) if has[MASSLESS] else None,
                 self._array(item, MASSLESS_VELOCITY, others) if has[MASSLESS_VELOCITY] else None,
-                cell if cell.any() else None,
-                float(info["time_ps"]),
-                int(info["step"]),
-            )
+                cell if cell.any() else None, float(info["time_ps"]), int(info["step"]),
+            )  # fmt: skip
         except (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
@@ -105,15 +110,106 @@ class TrajReader:
         return found
 
     def _array(self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
-        """An array of an item, of this type and shape (-1: any length)."""
+        """An array of an item with this type and shape (-1: any length)."""
         try:
             there = item.proxy(name)
             fits = len(shape) == there.ndim and all(n in (-1, m) for n, m in zip(shape, there.shape, strict=False))
             if there.dtype != kind or not fits or there.offset < 0 or there.offset + there.nbytes > self._size:
-                raise ValueError(f"it is damaged: {name} is not what it should be")
+                raise ValueError(f"it is damaged: {name} has the wrong type, shape or offset")
             found = np.array(there.read())
         except (AssertionError, AttributeError, KeyError, TypeError, IndexError, OverflowError, MemoryError):
-            raise ValueError(f"it is damaged, or no trajectory of rigidmd: it has no {name}") from None
+            raise ValueError(f"it is damaged, or not a trajectory of rigidmd: it has no {name}") from None
         if kind is np.float64 and not np.isfinite(found).all():
-            raise ValueError(f"it is damaged: {name} has what is no finite number")
+            raise ValueError(f"it is damaged: {name} has values that are not finite")
         return found
+
+
+class TrajFile(FrameFile):
+    """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and `ase.io.read`."""
+
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+        super().__init__(path, system, velocities, wrapped, kept)
+        self._massive = np.flatnonzero(system.sites.mass > 0)
+        self._massless = np.flatnonzero(system.sites.mass == 0)
+        # its symbols, masses and periodicity are the same in every frame
+        self._template = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        if kept is None:
+            self._begin()
+        elif kept[1]:
+            for _ in self._kept_frames():
+                pass
+
+    def _begin(self) -> None:
+        with writing(self._path):
+            create_empty_file(self._path)
+            self._file = _open(self._path, "w")
+
+    def cut(self) -> None:
+        """Leave out the frames after the checkpoint."""
+        if not self._kept or not self._kept[1]:
+            self._begin()
+            return
+        with atomic_file(self._path) as temporary, contextlib.closing(_open(temporary, "w")) as new:
+            for frame in self._kept_frames():
+                self._append(new, frame)
+        with writing(self._path):
+            self._file = _open(self._path, "a")
+
+    @property
+    def kept(self) -> tuple[int, int]:
+        with writing(self._path):
+            os.fsync(self._file.backend.fd.fileno())
+        return super().kept
+
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        system = self._system
+        position = system.site_positions(state, self._wrapped)
+        cell = state.cell if np.isfinite(state.cell).all() else None
+        found = Stored(position[self._massive], None, None, None, cell, float(time), int(step))
+        if len(self._massless):
+            found = found._replace(massless=position[self._massless])
+        if self._velocities:
+            velocity = system.site_velocities(state)
+            moving = atoms_of_sites(system, position, velocity, state.cell, time)
+            found = found._replace(momenta=moving.get_momenta())
+            if len(self._massless):
+                found = found._replace(massless_velocity=velocity[self._massless])
+        with writing(self._path):
+            self._append(self._file, found)
+            self._sum, self._frames = self._summed(found), self._frames + 1
+
+    def _append(self, file: Any, frame: Stored) -> None:
+        atoms = self._template
+        atoms.set_positions(frame.positions)
+        if frame.cell is not None:
+            atoms.set_cell(frame.cell)
+        if frame.momenta is not None:
+            atoms.set_momenta(frame.momenta)
+        atoms.info = {"time_ps": frame.time, "step": frame.step}
+        additional = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
+        if len(file.backend) == 0:
+            additional[ATOMS] = self._massive.astype(np.int64)
+        file.backend.write(**{name: array for name, array in additional.items() if array is not None})
+        file.write(atoms)
+
+    def _stored_frames(self, count: int) -> Iterator[Stored]:
+        sites = len(self._system.sites.mass)
+        with contextlib.closing(TrajReader(self._path)) as old:
+            if old.count < count or old.sites != sites:
+                raise ValueError(f"{count} frames of {sites} sites are needed")
+            for k in range(count):
+                yield old.read(k)
+
+    def _summed(self, frame: Stored) -> int:
+        found = self._sum
+        for part in (*frame[:5], np.array([frame.time, float(frame.step)])):
+            if part is not None:
+                found = zlib.crc32(np.ascontiguousarray(part, float).tobytes(), found)
+        return found
+
+
+def _open(path: Path, mode: str) -> Any:
+    from ase.io.trajectory import TrajectoryWriter  # slow to import
+
+    return TrajectoryWriter(path, mode)

@@ -1,4 +1,4 @@
-"""A frame of a trajectory as the atoms of a structure: through MDAnalysis, a .gsd by its own library."""
+"""A frame of a trajectory as the atoms of a structure, read through MDAnalysis, a .gsd by its library."""
 
 import contextlib
 import os
@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.errors import StructureError
-from rigidmd.io.atoms import Atoms
+from rigidmd.io.atoms import Atoms, structure_error
 from rigidmd.io.formats.gsd import GsdReader
 
 #: The program that reads a frame.
@@ -19,20 +18,20 @@ PROGRAM = Path(__file__).with_name("frame_reader.py")
 
 
 def read_trajectory(path: Path, frame: int | None, named: Callable[[], Atoms] | None) -> Atoms:
-    """The atoms of a frame, 1 for the first and -1 for the last, which None stands for too. Raises StructureError.
+    """The atoms of a frame: 1 for the first, -1 or None for the last. Raises StructureError.
 
-    named : gives the atoms of the topology file, whose names count; None for a .gsd, which has names
+    named : returns the atoms of the topology file, for their names; None for a .gsd, which has names
     """
     frame = -1 if frame is None else frame
     if named is None:
         return _read_gsd(path, frame)
     atoms = named()
-    found = read_apart(path, frame, len(atoms.names))
+    found = read_in_process(path, frame, len(atoms.names))
     return atoms._replace(position=found["position"], velocity=found.get("velocity"), cell=found.get("cell"))
 
 
-def read_apart(path: Path, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """What `frame_reader` finds, as a program of its own, which a damaged file may crash. Raises StructureError."""
+def read_in_process(path: Path, frame: int, atoms: int) -> dict[str, np.ndarray]:
+    """The arrays of `frame_reader`, a separate process, which a damaged file may crash. Raises StructureError."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "frame.npz"
         command = [sys.executable, "-P", str(PROGRAM), str(path), str(frame), str(atoms), str(target)]
@@ -41,12 +40,12 @@ def read_apart(path: Path, frame: int, atoms: int) -> dict[str, np.ndarray]:
             command, env=os.environ | {"PYTHONPATH": paths}, stdin=subprocess.DEVNULL, capture_output=True, check=False
         )
         if ended.returncode < 0 or not target.is_file():
-            told = "its reader crashed" if ended.returncode < 0 else ended.stderr.decode(errors="replace")[-300:]
-            raise StructureError(str(path), [f"cannot be read as a trajectory: {told}. Is it damaged?"])
+            reason = "its reader crashed" if ended.returncode < 0 else ended.stderr.decode(errors="replace")[-300:]
+            raise structure_error(path, f"cannot be read as a trajectory: {reason}. Is it damaged?")
         with np.load(target, allow_pickle=False) as data:
             found = dict(data)
-    if "fault" in found:
-        raise StructureError(str(path), [f"cannot be read as a trajectory: {found['fault']}"])
+    if "error" in found:
+        raise structure_error(path, f"cannot be read as a trajectory: {found['error']}")
     return found
 
 
@@ -54,20 +53,15 @@ def _read_gsd(path: Path, frame: int) -> Atoms:
     try:
         with contextlib.closing(GsdReader(path)) as reader:
             if not 1 <= abs(frame) <= reader.count:
-                told = f"structure.frame is {frame}: it holds {reader.count}, 1 is the first and -1 the last"
-                raise StructureError(str(path), [told])
+                raise structure_error(
+                    path, f"structure.frame is {frame}: it holds {reader.count}, 1 is the first and -1 the last"
+                )
             found = reader.read(frame - 1 if frame > 0 else reader.count + frame)
     except (OSError, ValueError) as error:
-        raise StructureError(str(path), [f"cannot be read as a trajectory: {error}"]) from None
+        raise structure_error(path, f"cannot be read as a trajectory: {error}") from None
     sites = found.sites
-    names = [found.label[site].rsplit(".", 1)[-1] for site in sites]  # species.name, where a type tells the species
+    names = [found.label[site].rsplit(".", 1)[-1] for site in sites]  # a type may be species.name
     return Atoms(
-        names,
-        [""] * len(names),
-        [(int(owner) + 1, found.label[owner]) for owner in found.owner[sites]],
-        found.position[sites],
-        found.site_velocities(),
-        found.cell,
-        None,
-        [],
-    )
+        names, [""] * len(names), [(int(owner) + 1, found.label[owner]) for owner in found.owner[sites]],
+        found.position[sites], found.site_velocities(), found.cell, None, [],
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What viewers draw as bonds: those of molecules, and the edges of a single body between its points."""
+"""Bonds for viewers and topology files: those of molecules, and the edges between the points of a single body."""
 
 from itertools import combinations
 
@@ -8,19 +8,21 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.scene.models import Molecule
 
-#: Normals of two sides of a hull that differ by less belong to one flat side; thickness, as a share of the size, below
-#: which points lie in a plane or on a line.
+#: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the size below which
+#: points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
 
 
 def connections(system: System | BodySystem, massless: bool = False) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined; of molecules also massless sites to their nearest atoms if asked for, so
-    that each molecule is in one piece."""
+    """Pairs (b, 2) of sites that are joined.
+
+    massless : whether massless sites are joined to their nearest atoms, so that each molecule is connected
+    """
     return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system, massless)
 
 
 def charges(system: System | BodySystem) -> np.ndarray:
-    """Charges (s,) of all sites, e; of a single body zero."""
+    """Charges (s,) of all sites, e; 0 for a single body."""
     if isinstance(system, BodySystem):
         return np.zeros(len(system.points))
     return np.concatenate([system.species[kind].charges for kind in system.model.species])
@@ -35,13 +37,13 @@ def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
 
 
 def _edges_of_body(system: BodySystem) -> np.ndarray:
-    """Edges of the hull of a solid, or the shortest links between points; a pinned body hangs on the pivot."""
-    first = 0 if system.flies else 1  # the pivot is the first point
-    own = system.points[first:]
-    found = _shortest(own) if system.scene.body.points is not None else _hull(own)
+    """Edges of the hull of a solid, or the shortest links between points. A pinned body is linked to the pivot."""
+    first = 0 if system.translates else 1  # the pivot is the first point
+    points = system.points[first:]
+    found = _shortest(points) if system.scene.body.points is not None else _hull(points)
     pairs = found + first
-    if first and len(own):
-        nearest = int(np.linalg.norm(own - system.centre, axis=1).argmin())
+    if first and len(points):
+        nearest = int(np.linalg.norm(points - system.centre, axis=1).argmin())
         pairs = np.vstack([[0, first + nearest], pairs]) if len(pairs) else np.array([[0, first + nearest]])
     return pairs.reshape(-1, 2).astype(int)
 
@@ -56,7 +58,7 @@ def _shortest(points: np.ndarray) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Edges of the convex hull of points, in space, in a plane or on a line; the points inside are joined to none."""
+    """Edges of the convex hull of points in space, in a plane or on a line. Points inside have none."""
     from scipy.spatial import ConvexHull
 
     if len(points) < 2:
@@ -75,7 +77,7 @@ def _hull(points: np.ndarray) -> np.ndarray:
         for i, j in ((0, 1), (1, 2), (2, 0)):
             pair = tuple(sorted((int(corners[i]), int(corners[j]))))
             normals.setdefault(pair, []).append(equation[:3])  # pyright: ignore[reportArgumentType]
-    # the diagonals of a flat side are no edges
+    # without the diagonals of flat sides
     return np.array([pair for pair, (one, other) in normals.items() if np.abs(one - other).max() > FLAT])
 
 
@@ -86,8 +88,8 @@ SLACK = 1.25
 
 
 def bonds(m: Molecule) -> list[tuple[int, int]]:
-    """Links between sites, heavier site first: atoms within bonding distance, the shortest links that connect separate
-    parts, and each massless site to its nearest atom."""
+    """Bonds between sites, heavier site first: atoms within bonding distance, the shortest links between parts, and
+    massless sites to their nearest atoms."""
     atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
     part = {i: i for i in atoms}
     found = []

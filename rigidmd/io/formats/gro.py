@@ -1,0 +1,66 @@
+"""Reader of .gro. ASE reads neither more digits, nor several frames, nor velocities of some atoms only."""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.core.toml import parse_whole_number
+from rigidmd.io.atoms import Atoms, structure_error
+from rigidmd.io.formats.text import numbers, unexpected
+
+
+def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The frames of a .gro: title, number of atoms, atoms, box; once or more."""
+    while lines and not lines[-1].strip():
+        lines.pop()
+    frames, first = [], 0
+    while first < len(lines):
+        promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
+        if not lines[first].strip() and parse_whole_number(promised) is None:  # an empty line, not an empty title
+            first += 1
+            continue
+        count = parse_whole_number(promised)
+        if count is None:
+            raise unexpected(path, first + 2, "the number of atoms", promised)
+        box = first + 2 + count
+        if box >= len(lines):
+            found = f"{max(0, len(lines) - first - 3)} are there: truncated?"
+            raise structure_error(path, f"line {first + 2} promises {count} atoms and a box, {found}")
+        what = "the box, 3 or 9 numbers (is the number of atoms right?)"
+        edges = numbers(path, box + 1, lines[box].split(), what)
+        if len(edges) not in (3, 9):
+            raise unexpected(path, box + 1, what, lines[box].strip())
+        frames.append(partial(_gro_frame, path, lines, first, box, edges))
+        first = box + 1
+    return frames
+
+
+def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[float]) -> Atoms:
+    """The frame in lines `first` to `box`. Column width is the distance between decimal points, as in GROMACS."""
+    names, residue = [], []
+    position, velocity = np.zeros((box - first - 2, 3)), np.full((box - first - 2, 3), np.nan)
+    points = [m.start() for m in re.finditer(r"\.", lines[first + 2][20:])] if box > first + 2 else []
+    width = points[1] - points[0] if len(points) > 1 else 8
+    cuts = list(pairwise(range(20, 21 + 6 * width, width)))
+    for k in range(first + 2, box):
+        line = lines[k]
+        values = [line[a:b].strip() for a, b in cuts]
+        what = f"an atom of a .gro with coordinates in columns of {width} (is the number of atoms right?)"
+        position[k - first - 2] = numbers(path, k + 1, values[:3], what)
+        given = [v for v in values[3:] if v]
+        if len(given) == 3:
+            found = numbers(path, k + 1, given, "three velocities")
+            if not np.isfinite(found).all():
+                owner = f"line {k + 1}: atom {k - first - 1}"
+                raise structure_error(path, f"{owner} has a velocity that is not a finite number")
+            velocity[k - first - 2] = found
+        names.append(line[10:15].strip())
+        residue.append((parse_whole_number(line[:5].strip()), line[5:10].strip()))
+    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
+    cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
+    moving = None if np.isnan(velocity).all() else 10 * velocity
+    return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)

@@ -1,0 +1,89 @@
+"""Reader of .pdb. ASE reads neither numbers wider than their columns nor a CRYST1 that stands for no cell."""
+
+import contextlib
+import re
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
+from rigidmd.io.formats.text import cell_of, numbers, unexpected
+
+#: Columns of the edges and angles in CRYST1.
+CRYST1 = (6, 15, 24, 33, 40, 47, 54)
+#: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits of a residue number.
+IN_COLUMNS = re.compile(r" *-?\d+\.\d{3}")
+BEYOND = re.compile(r"\w{0,3}\s" + 3 * r"\s*(-?\d+\.\d{3})")
+FREE = re.compile(r"\w{0,3}" + 3 * r"\s+([-+]?\d*\.\d*(?:[eEdD][-+]?\d+)?)" + r"(?=\s|$)")
+
+
+def read_pdb(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The models of a .pdb, each with the last CRYST1 before it."""
+    models, body, cell, notes = [], [], None, []
+    ends = next((line for line in reversed(lines) if line.strip()), "")
+    cut = ["it ends with an atom, without END: is it truncated?"] if ends.startswith(("ATOM", "HETATM")) else []
+    for number, line in enumerate([*lines, "END"], 1):
+        if line.startswith("CRYST1"):
+            cell, notes = _cryst1(number, line)
+        elif line.startswith(("ATOM", "HETATM")):
+            body.append((number, line))
+        elif line.startswith("END") and body:
+            models.append(partial(_pdb_model, path, body, cell, [*notes, *(cut if number > len(lines) else [])]))
+            body = []
+    return models
+
+
+def _cryst1(line: int, text: str) -> tuple[np.ndarray | None, list[str]]:
+    """The cell of a CRYST1, separated by spaces or in columns. None and a note if it stands for no cell (zeros)."""
+    for words in (text[6:].split()[:6], [text[a:b] for a, b in pairwise(CRYST1)]):
+        with contextlib.suppress(ValueError):
+            values = [float(word) for word in words]
+            if len(values) == 6:
+                cell = cell_of(values)
+                text = " ".join(f"{x:g}" for x in values)
+                return cell, [] if cell is not None else [f"line {line}: CRYST1 of {text} defines no cell"]
+    return None, [f"line {line}: CRYST1 needs three edges and three angles, found {text[6:].strip()!r}"]
+
+
+def _pdb_model(path: Path, body: list[tuple[int, str]], cell: np.ndarray | None, notes: list[str]) -> Atoms:
+    """One model. Residues are renumbered, because their numbers may wrap or be missing."""
+    names, elements, residue, position, locations = [], [], [], [], set()
+    count, last = 0, None
+    for number, full in body:
+        line, end, coordinates = _pdb_columns(path, number, full)
+        position.append(coordinates)
+        symbol = full[end + 22 : end + 24].strip().capitalize()
+        names.append(line[12:16].strip())
+        elements.append(symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else "")
+        locations.add(line[16:17].strip())
+        if (here := line[17:28]) != last:  # name, chain, number and insertion code
+            count, last = count + 1, here
+        digits = re.match(r" *(\d+)", line[22:30])
+        residue.append((int(digits[1]) if digits else None, line[17:21].strip(), count))
+    if len(locations := locations - {""}) > 1:
+        raise structure_error(path, f"has alternate locations {', '.join(sorted(locations))}; keep one of them")
+    if count == 1 and not residue[0][1]:
+        residue = [()] * len(names)
+    return Atoms(names, elements, residue, np.array(position), cell=cell, notes=notes)
+
+
+def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[float]]:
+    """A line of an atom with names in the columns of the format, the end of the coordinates in the given line, and the
+    coordinates. Numbers wider than their columns shift the rest."""
+    fields = [line[a : a + 8] for a in (30, 38, 46)]
+    if all(map(IN_COLUMNS.fullmatch, fields)):
+        return line, 54, [float(field) for field in fields]
+    serial = re.match(r"(?:ATOM  |HETATM)(\d*)", line)
+    moved = max(0, len(serial[1]) - 5) if serial else 0
+    straight = line[:11] + line[11 + moved :]
+    found = BEYOND.match(line, 26 + moved)
+    joined = any(not line[a - 1 : a].isspace() and line[a : a + 1].isalnum() for a in (30, 38, 46, 54))
+    if not found and not joined:
+        with contextlib.suppress(ValueError):
+            return line, 54, [float(field) for field in fields]
+    if not (found := found or FREE.match(line, 26 + moved)):
+        raise unexpected(path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60])
+    return straight, found.end(), numbers(path, number, list(found.groups()), "three coordinates")
