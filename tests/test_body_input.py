@@ -79,7 +79,7 @@ def faults(**tables):
         ({"body": {"mass_kg": 1.0, "pinned": True, "centre_of_mass_m": [0.0, 0, 1]},
           "changing_inertia": {"times_s": [0.0, 1.0], "inertia_kg_m2": [[1.0, 1, 1], [2.0, 2, 2]]}}, "must be at the pivot"),
         ({"body": {"mass_kg": 1.0, "pinned": True, "inertia_about": "pivot"}}, "no inertia is given"),
-        ({"friction": {"dry_N_m": [0.1, 0, 0]}, "run": RUN | {"integrator": "dop853"}}, "dry friction jumps"),
+        ({"friction": {"dry_N_m": [0.1, 0, 0]}, "run": RUN | {"integrator": "dop853"}}, "dry friction is discontinuous"),
         ({"friction": {"viscous_N_m_s": [0.1, 0, 0]}, "run": RUN | {"integrator": "kahan_li_6"}}, "negative substeps"),
         ({"start": {"angular_velocity_body_rad_s": [1e200, 0, 0]}}, "must be 0 or between 1e-100 and 1e100"),
         ({"start": {"euler_angles_deg": [0.0, 20.0]}}, "start.euler_angles_deg: has 2 entries, needs more"),
