@@ -250,7 +250,6 @@ def target_pressure(pressure, state, k):
 
 @kernel
 def save_before_move(state, load, workspace):
-    """Copy what a move changes."""
     copy(state.position, workspace.position)
     copy(state.velocity, workspace.velocity)
     copy(load.force, workspace.load.force)
@@ -261,7 +260,6 @@ def save_before_move(state, load, workspace):
 
 @kernel
 def undo_move(state, load, workspace):
-    """Undo a move."""
     copy(workspace.position, state.position)
     copy(workspace.velocity, state.velocity)
     copy(workspace.load.force, load.force)

@@ -47,7 +47,6 @@ class FlowArrays(NamedTuple):
 
 
 def flow_arrays(scheme: Scheme) -> FlowArrays:
-    """The flows of a scheme."""
     kind = np.array([flow.kind for flow in scheme.flows])
     fraction = np.array([flow.fraction for flow in scheme.flows])
     moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))

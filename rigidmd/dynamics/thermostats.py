@@ -27,7 +27,6 @@ class Ramp(NamedTuple):
 
 
 def constant_ramp(value: float) -> Ramp:
-    """A number that does not change."""
     return Ramp(value, value, 1.0)
 
 

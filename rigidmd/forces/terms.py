@@ -32,7 +32,6 @@ def workspace_of(term: NamedTuple, setup: Setup) -> NamedTuple:
 
 
 def with_code(workspace: NamedTuple) -> NamedTuple:
-    """The workspace with its machine code."""
     return workspace.with_code() if hasattr(workspace, "with_code") else workspace
 
 
@@ -135,7 +134,6 @@ class TermTable(NamedTuple):
 
 
 def empty_term_table(terms: int, time_dependent: bool, with_energies: np.ndarray) -> TermTable:
-    """A table without addresses."""
     plain, tallied, rate, content = np.zeros((4, terms), np.intp)
     known, status = np.zeros((2, 1), np.int64)
     tallies = np.zeros((terms, TALLY_SIZE))
@@ -277,7 +275,6 @@ def compute_body_load(terms, state, load, tally):
 
 @kernel
 def total_power(terms, state, velocity, omega):
-    """`power` of all terms."""
     total = 0.0
     for term in literal_unroll(terms):
         total += power(term, state, velocity, omega)
@@ -286,7 +283,6 @@ def total_power(terms, state, velocity, omega):
 
 @kernel
 def total_energy_rate(table):
-    """`energy_rate` of all terms."""
     table.power[0] = 0.0
     for k in range(len(table.arguments_address)):
         call_address(table.rate_address[k], table.arguments_address[k], FORCES_ONLY)

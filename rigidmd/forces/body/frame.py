@@ -14,8 +14,6 @@ from rigidmd.mechanics.time_functions import TimeFunction, value
 
 
 class InertialFrame(NamedTuple):
-    """Axes that do not rotate."""
-
     rate: float = 0.0
 
 

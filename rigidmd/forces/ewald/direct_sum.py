@@ -59,8 +59,6 @@ class KSpaceSums(NamedTuple):
 
 
 class EwaldSum(NamedTuple):
-    """The direct sum over k-vectors."""
-
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
     sites: BodySites | CentralSites
@@ -247,7 +245,6 @@ def add_k_vector_virial(tally, energy, k, slope):
 
 @task(count_references=False)
 def _compute_forces(arguments, block):
-    """Forces on the sites of a block."""
     _alpha, k_vectors, sums = load_arguments(arguments)
     width = lanes_of(sums.charge)
     blocks, vectors = len(sums.tallies), len(sums.charge) // width

@@ -15,6 +15,7 @@ each plane is written by one block. The number of blocks does not depend on the 
 same bit for bit. This module needs rocket-fft; only scenes with PME import it.
 """
 
+# isort: skip_file
 from math import pi
 from typing import NamedTuple
 
@@ -22,31 +23,16 @@ import numpy as np
 from rocket_fft import c2c, c2r, r2c
 
 from rigidmd.compile import (
-    BLOCKS,
-    MOST_BLOCKS,
-    Code,
-    call,
-    call_blocks,
-    implements,
-    is_a,
-    kernel,
-    load_arguments,
-    pack_arguments,
-    task,
-)
+    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task,
+)  # fmt: skip
 from rigidmd.compile.simd import load_eight, load_four, store, sum_lanes
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.ewald.direct_sum import add_k_vector_virial, invert_cell
 from rigidmd.forces.ewald.splines import aliases, weights
 from rigidmd.forces.neighbors.sites import (
-    BodySites,
-    CentralSites,
-    blocks_of,
-    site_tasks,
-    to_molecular_virial,
-    virial_buffer,
-)
+    BodySites, CentralSites, blocks_of, site_tasks, to_molecular_virial, virial_buffer,
+)  # fmt: skip
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
 
@@ -95,8 +81,6 @@ class PmeMesh(NamedTuple):
 
 
 class Pme(NamedTuple):
-    """The reciprocal part by smooth particle mesh Ewald."""
-
     alpha: float  # 1/Å
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
     sites: BodySites | CentralSites

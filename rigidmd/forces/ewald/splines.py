@@ -33,7 +33,6 @@ class Aliases(NamedTuple):
 
 
 def aliases(points: int, order: int) -> Aliases:
-    """The sums for a grid with this number of points along the axis."""
     n = np.arange(points)
     n = np.where(2 * n > points, n - points, n)
     every = n[:, None] + points * np.arange(-ALIASES, ALIASES + 1)

@@ -26,8 +26,6 @@ from rigidmd.mechanics.translation import body_component
 
 
 class ElectricField(NamedTuple):
-    """A steady uniform field."""
-
     species: np.ndarray  # (n,) int32
     charge: np.ndarray  # (species,) net charge, e; 0 for a frozen species
     dipole_body: np.ndarray  # (species, 3) about the centre of mass, e Å; 0 for a frozen species

@@ -66,8 +66,6 @@ class HarmonicWalls(NamedTuple):
 
 
 class SiteBehindWall(NamedTuple):
-    """A site that is behind a wall."""
-
     molecule: int
     axis: int
     coordinate: float  # of the site, Å

@@ -5,6 +5,7 @@ accurate enough: 2e-7 Å for sites within reach of one another. Arrays of positi
 as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`.
 """
 
+# isort: skip_file
 from math import ceil, floor, inf, nan
 from typing import NamedTuple
 
@@ -12,16 +13,8 @@ import numpy as np
 
 from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
 from rigidmd.compile.simd import (
-    lane_count,
-    lanes_of,
-    largest_lane,
-    load,
-    load_scalar,
-    mask_bits,
-    square_root,
-    store,
-    zeros,
-)
+    lane_count, lanes_of, largest_lane, load, load_scalar, mask_bits, square_root, store, zeros,
+)  # fmt: skip
 from rigidmd.forces.neighbors.sites import index_of_x, locate_site, predict_site
 
 MAX_SERIAL_SITES = 128  # in one block

@@ -5,6 +5,7 @@ A potential computes only the energy and force between one site and a vector of 
 loop finds the pairs and their images, sums energies, virial and forces, and adds the forces to the bodies.
 """
 
+# isort: skip_file
 from math import inf
 from typing import NamedTuple
 
@@ -12,61 +13,26 @@ import numpy as np
 from numba import types
 
 from rigidmd.compile import Code, call, call_blocks, implements, kernel, load_arguments, pack_arguments, task
-from rigidmd.compile.simd import (  # fmt: skip
-    add_lane_sums,
-    align_stack,
-    broadcast,
-    convert_to,
-    extract_lane,
-    lane_count,
-    lanes_of,
-    load,
-    load_broadcast,
-    load_four,
-    load_scalar,
-    mask_from_bits,
-    select,
-    store,
-    sum_lanes,
-    to_double,
-    zeros,
-)
+from rigidmd.compile.simd import (
+    add_lane_sums, align_stack, broadcast, convert_to, extract_lane, lane_count, lanes_of, load, load_broadcast,
+    load_four, load_scalar, mask_from_bits, select, store, sum_lanes, to_double, zeros,
+)  # fmt: skip
 from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.neighbors import lists
-from rigidmd.forces.neighbors.lists import (  # fmt: skip
-    BUILDS,
-    STATUS,
-    USABLE,
-    WINDOW,
-    PairList,
-    behind_block,
-    cluster_of,
-    empty_list,
-    end_of_row,
-    image_number,
-    lanes_of_first,
-    lanes_of_second,
-    largest_displacement,
-    most_needed,
-)
-from rigidmd.forces.neighbors.sites import (  # fmt: skip
-    BodySites,
-    CentralSites,
-    InSlots,
-    add_offset_virial_of_block,
-    blocks_of,
-    load_block,
-    to_molecular_virial,
+from rigidmd.forces.neighbors.lists import (
+    BUILDS, STATUS, USABLE, WINDOW, PairList, behind_block, cluster_of, empty_list, end_of_row, image_number,
+    lanes_of_first, lanes_of_second, largest_displacement, most_needed,
+)  # fmt: skip
+from rigidmd.forces.neighbors.sites import (
+    BodySites, CentralSites, InSlots, add_offset_virial_of_block, blocks_of, load_block, to_molecular_virial,
     virial_buffer,
-)
+)  # fmt: skip
 from rigidmd.forces.neighbors.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
 
 
 class PairSums(NamedTuple):
-    """Sums of forces and energies, and scratch."""
-
     forces: np.ndarray  # (3 slots,) on each site, from the rows of its block, then from all; as Clusters.local
     forces_behind: np.ndarray  # (blocks, capacity) forces from the rows of a block on the clusters behind it
     force_at_change: np.ndarray  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
@@ -129,7 +95,6 @@ class PairWorkspace(NamedTuple):
         return InSlots(self.sums.forces, self.pairs.clusters.slot)
 
     def with_code(self) -> "PairWorkspace":
-        """With machine code."""
         state, load = EXAMPLE
         list_tasks = list_code(self.pairs, self.sites)
         content = (self.slot_potential, self.pairs, self.sums)
@@ -456,7 +421,7 @@ def _load_origin_vector(pairs, c, neighbors, origin_vector, number):
 
 @kernel(inline=True)
 def _separation(here, x, y, z):
-    """Displacements of a site from a vector of forces_behind, and the squared distances."""
+    """Displacements of a site from a vector of others, and the squared distances."""
     dx, dy, dz = here[0] - x, here[1] - y, here[2] - z
     return dx, dy, dz, dx * dx + dy * dy + dz * dz
 
@@ -505,7 +470,7 @@ def _with_product(virial, force, at):
 
 @kernel(inline=True)
 def _masked_pair(potential, i, j, r2, mask):
-    """Force over distance on a site from each of a vector of forces_behind, and the energies; 0 where there is none."""
+    """Force over distance on a site from each of a vector of others, and the energies; 0 where there is none."""
     counts = r2 < potential.cutoff * potential.cutoff
     if mask is not None:
         counts = counts & mask_from_bits(mask, r2)

@@ -1,41 +1,20 @@
 """The rows of a neighbour list: which clusters go into which row and shell, and which of them need a mask."""
 
+# isort: skip_file
 from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import kernel
-from rigidmd.compile.simd import (  # fmt: skip
-    broadcast,
-    lanes_of,
-    load,
-    load_broadcast,
-    load_scalar,
-    load_with_lanes_of,
-    mask_bits,
-    maximum,
-    minimum,
-    pairwise_minimum,
-    square_root,
-    store_even_lanes,
-)
-from rigidmd.forces.neighbors.lists import (  # fmt: skip
-    ENTRIES,
-    IMAGES,
-    IMAGES_FOUND,
-    MASK_BITS,
-    MASKED,
-    MAX_BEYOND,
-    NEIGHBORS,
-    NEIGHBORS_OF_ONE,
-    ROUNDING,
-    SHELLS,
-    WINDOW,
-    behind_block,
-    cluster_of,
-    image_number,
-)
+from rigidmd.compile.simd import (
+    broadcast, lanes_of, load, load_broadcast, load_scalar, load_with_lanes_of, mask_bits, maximum, minimum,
+    pairwise_minimum, square_root, store_even_lanes,
+)  # fmt: skip
+from rigidmd.forces.neighbors.lists import (
+    ENTRIES, IMAGES, IMAGES_FOUND, MASK_BITS, MASKED, MAX_BEYOND, NEIGHBORS, NEIGHBORS_OF_ONE, ROUNDING, SHELLS, WINDOW,
+    behind_block, cluster_of, image_number,
+)  # fmt: skip
 from rigidmd.forces.neighbors.tree import ahead, families_within_reach, near
 
 OUT_OF_REACH = SHELLS  # kind of a candidate that a row does not need; kinds below are shells
@@ -44,8 +23,6 @@ KINDS = SHELLS + 2
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for the rows of one cluster."""
-
     stack: np.ndarray  # (levels, 2) for families_within_reach
     low: np.ndarray  # (3,) of a box, shifted by an image
     high: np.ndarray  # (3,)
@@ -158,7 +135,6 @@ def _find_candidates(pairs, c, scratch, families):
 
 @kernel(inline=True, count_references=False)
 def _fill_rows(pairs, block, c, scratch, candidates):
-    """Fill the rows of a cluster from its candidates."""
     width = lanes_of(pairs.clusters.local)
     rows = width // 2
     masked, filled = pairs.masked[block], scratch.filled
@@ -310,7 +286,7 @@ def _half_square_less_product(clusters, other, lane, x, y, z):
 
 @kernel(inline=True)
 def _mark_entries_to_mask(pairs, c, kind, candidate, at):
-    """Set the kind of a candidate to SPECIAL in the rows for which it needs a mask."""
+    """Set the kind of a candidate to NEEDS_MASK in the rows for which it needs a mask."""
     clusters = pairs.clusters
     width = lanes_of(clusters.local)
     other, last = cluster_of(candidate), len(clusters.origin) // 4 - 1
@@ -345,7 +321,7 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     if other == c:
         left_out |= (2 << (i - width * c)) - 1  # each pair once
     if other == len(clusters.origin) // 4 - 1:
-        left_out |= all_lanes ^ (all_lanes >> _padding_slots(pairs))
+        left_out |= all_lanes ^ (all_lanes >> (len(clusters.order) - len(pairs.group)))  # slots without a site
     meets = all_lanes & ~left_out
     return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
@@ -371,9 +347,3 @@ def _origin_vector(pairs, c, other, image, k):
     """Component k of the vector from the image of another cluster's origin to the origin of cluster c, Å."""
     clusters = pairs.clusters
     return clusters.origin[4 * c + k] - pairs.shift[4 * image + k] - clusters.origin[4 * other + k]
-
-
-@kernel(inline=True)
-def _padding_slots(pairs):
-    """Number of slots in the last cluster that hold no site."""
-    return len(pairs.clusters.order) - len(pairs.group)

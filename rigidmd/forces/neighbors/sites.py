@@ -3,22 +3,15 @@
 Each potential has a list of the sites that take part in it. Sites of one molecule are consecutive.
 """
 
+# isort: skip_file
 from typing import NamedTuple
 
 import numpy as np
 from numba import types
 
 from rigidmd.compile import (
-    BLOCKS,
-    MOST_BLOCKS,
-    call_blocks,
-    implements,
-    is_a,
-    kernel,
-    load_arguments,
-    pack_arguments,
-    task,
-)
+    BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task,
+)  # fmt: skip
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import EXAMPLE
 
@@ -149,7 +142,7 @@ def _locate_site(sites, state, m, i):
         return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
 
     def locate_site(sites, state, m, i):
-        x, y, z = turned(sites, state, m, i)
+        x, y, z = site_offset_lab(sites, state, m, i)
         centre = state.position[np.uint64(m)]
         return centre[0] + x, centre[1] + y, centre[2] + z
 
@@ -196,7 +189,7 @@ def _predict_site(sites, state, m, i, lead):
 
 
 @kernel(inline=True)
-def turned(sites, state, m, i):
+def site_offset_lab(sites, state, m, i):
     """Vector (x, y, z) from the centre of mass of molecule m to its site i, lab frame, Å."""
     m = np.uint64(m)
     q = state.rotation[m]
@@ -351,7 +344,7 @@ def _add_offset_virial_of(sites, state, m, site_force, virial):
 
     def add_offset_virial(sites, state, m, site_force, virial):
         for i in range(sites.first[m], sites.first[m + 1]):
-            offset = turned(sites, state, m, i)
+            offset = site_offset_lab(sites, state, m, i)
             force = site_vector(site_force, i)
             for row in range(3):
                 for k in range(3):

@@ -34,7 +34,6 @@ def empty_tree(count: int) -> BoxTree:
 
 @kernel(count_references=False)
 def fit_boxes(tree, clusters):
-    """Fit the boxes to newly sorted clusters."""
     arity = lanes_of(tree.low)
     width = lanes_of(clusters.local)
     tree.low[:] = inf

@@ -1,36 +1,18 @@
 """Update of a neighbour list: its sites move with the bodies, and it is rebuilt when it is not valid any longer."""
 
+# isort: skip_file
 from math import ceil, floor, inf, sqrt
 
 from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
-    bin_sites_of_block,
-    measure_displacements_of_block,
-    restore_half_squares,
-    set_local_of_block,
-    set_origins_of_block,
-    sort_into_clusters,
-    use_present_as_reference,
-    wrap_sites_of_block,
-)
-from rigidmd.forces.neighbors.lists import (  # fmt: skip
-    BUILDS,
-    BUILT,
-    ENTRIES,
-    IMAGES_FOUND,
-    LEAD_TIME,
-    LONGEST_SKIN,
-    MASKED,
-    MAX_NEIGHBORS,
-    NEIGHBORS,
-    NEIGHBORS_OF_ONE,
-    STATUS,
-    USABLE,
-    PairList,
-    largest_displacement,
-    most_needed,
-)
+    bin_sites_of_block, measure_displacements_of_block, restore_half_squares, set_local_of_block, set_origins_of_block,
+    sort_into_clusters, use_present_as_reference, wrap_sites_of_block,
+)  # fmt: skip
+from rigidmd.forces.neighbors.lists import (
+    BUILDS, BUILT, ENTRIES, IMAGES_FOUND, LEAD_TIME, LONGEST_SKIN, MASKED, MAX_NEIGHBORS, NEIGHBORS, NEIGHBORS_OF_ONE,
+    STATUS, USABLE, PairList, largest_displacement, most_needed,
+)  # fmt: skip
 from rigidmd.forces.neighbors.rows import fill_block, update_origin_vectors_of_block
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell

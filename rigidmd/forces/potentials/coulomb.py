@@ -1,5 +1,6 @@
 """Coulomb potential with a reaction field: q_i q_j (1/r + field r²) within a cutoff, a dielectric beyond it."""
 
+# isort: skip_file
 from math import inf, sqrt
 from typing import NamedTuple
 
@@ -9,22 +10,9 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.potentials.truncation import (
-    NO_SWITCH,
-    SWITCHES,
-    SwitchCorrection,
-    SwitchTerm,
-    Truncation,
-    TruncationName,
-    TruncationTerms,
-    correction,
-    needs_root,
-    switch_correction_of,
-    switch_term,
-    switch_term_of,
-    truncated,
-    truncation_of,
-    truncation_terms,
-)
+    NO_SWITCH, SWITCHES, SwitchCorrection, SwitchTerm, Truncation, TruncationName, TruncationTerms, correction,
+    needs_root, switch_correction_of, switch_term, switch_term_of, truncated, truncation_of, truncation_terms,
+)  # fmt: skip
 from rigidmd.units import COULOMB_CHARGE
 
 

@@ -5,6 +5,7 @@ A formula is a NamedTuple class, whose fields are the parameters of a pair of si
 vectors that the pair loop reads from a table.
 """
 
+# isort: skip_file
 from collections.abc import Callable
 from math import inf, pi
 from typing import Any, NamedTuple
@@ -16,14 +17,8 @@ from rigidmd.compile import implements, is_a
 from rigidmd.compile.simd import evaluate_cubic, inverse, inverse_square_root, load, select, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.potentials.truncation import (
-    SWITCH_FUNCTIONS,
-    ForceShifted,
-    Truncation,
-    TruncationTerms,
-    Unmodified,
-    truncated,
-    truncation_polynomial,
-)
+    SWITCH_FUNCTIONS, ForceShifted, Truncation, TruncationTerms, Unmodified, truncated, truncation_polynomial,
+)  # fmt: skip
 
 
 class CustomPotential(NamedTuple):
@@ -48,8 +43,6 @@ class CustomPotential(NamedTuple):
 
 
 class CustomOneKind(NamedTuple):
-    """A user potential for sites of a single kind."""
-
     cutoff: float
     truncation: Truncation
     formula: NamedTuple

@@ -274,7 +274,6 @@ def _powers_of(powers: Mapping[int, Any]) -> list[str]:
 
 
 def _code(e) -> str:
-    """An expression of SymPy as Python."""
     import sympy
 
     if e.is_Symbol:
@@ -321,8 +320,6 @@ def _parsed(energy: str, constants: Mapping[str, float]) -> "sympy.Expr":
 
 
 class _Part(NamedTuple):
-    """A part of a formula."""
-
     value: "sympy.Expr"
     number: float | None  # its value if it is a number
     digits: float  # upper limit of the decimal digits of a number in it, before or behind the point

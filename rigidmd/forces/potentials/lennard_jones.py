@@ -1,5 +1,6 @@
 """Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with truncation, mixing rules and tail correction."""
 
+# isort: skip_file
 from math import pi
 from typing import Literal, NamedTuple
 
@@ -9,26 +10,11 @@ from scipy.integrate import quad
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
-from rigidmd.forces.potentials.truncation import (  # fmt: skip
-    NO_SWITCH,
-    SWITCH_FUNCTIONS,
-    ForceShifted,
-    SwitchCorrection,
-    SwitchTerm,
-    Truncation,
-    TruncationName,
-    TruncationTerms,
-    Unmodified,
-    correction,
-    needs_root,
-    switch_correction_of,
-    switch_term,
-    switch_term_of,
-    truncated,
-    truncation_of,
-    truncation_polynomial,
-    truncation_terms,
-)
+from rigidmd.forces.potentials.truncation import (
+    NO_SWITCH, SWITCH_FUNCTIONS, ForceShifted, SwitchCorrection, SwitchTerm, Truncation, TruncationName,
+    TruncationTerms, Unmodified, correction, needs_root, switch_correction_of, switch_term, switch_term_of, truncated,
+    truncation_of, truncation_polynomial, truncation_terms,
+)  # fmt: skip
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 
@@ -61,13 +47,10 @@ class LennardJones(NamedTuple):
 def _switch_terms(
     truncation: Truncation, c12: float, c6: float, dtype: type
 ) -> tuple[SwitchTerm | tuple[()], SwitchTerm | tuple[()]]:
-    """The terms that a switch adds to the forces of c12/r¹² and c6/r⁶."""
     return switch_term_of(truncation, {12: c12}, dtype), switch_term_of(truncation, {6: c6}, dtype)
 
 
 class LennardJonesOneKind(NamedTuple):
-    """Lennard-Jones for sites of a single kind."""
-
     cutoff: float
     truncation: Truncation
     terms12: TruncationTerms

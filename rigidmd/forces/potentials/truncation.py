@@ -162,7 +162,7 @@ def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype
 
 
 def switch_term(truncation, switched, r):
-    """An `SwitchTerm` at distances r; 0 below the start, and for anything else."""
+    """A `SwitchTerm` at distances r; 0 below the start, and for anything else."""
     raise TypeError("compiled code only")
 
 
@@ -199,13 +199,11 @@ def _correction(truncation, switched, r2):
 
 @kernel(inline=True, from_python=True)
 def squared(x):
-    """x²"""
     return x * x
 
 
 @kernel(inline=True, from_python=True)
 def to_the_fourth(x):
-    """x⁴"""
     return x * x * (x * x)
 
 
