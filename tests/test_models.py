@@ -660,7 +660,7 @@ def test_a_model_without_a_table_has_masses_and_says_what_to_fill_in(own, capsys
     assert main(["models", "--from", "heavy water.xyz"]) == 0
     out, err = capsys.readouterr()
     assert "'heavy water.toml'" in out
-    assert "no interactions yet" in err
+    assert "has no interactions" in err
     text = (own / "heavy water.toml").read_text()
     assert text.startswith("# Sites have masses only")
     assert "charge_e = -0.1" in text

@@ -23,7 +23,7 @@ from rigidmd.forces.potentials.lennard_jones import sum_of_tails
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.user_code import missing_user_code
+from rigidmd.scene.molecules import missing_user_code
 
 
 def build(scene: MolecularScene, user_code: bool = True) -> System:

@@ -21,7 +21,7 @@ from rigidmd.io.cells import angles_deg, right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.user_code import name_of
+from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
 
 #: Precision of forces, for reports. Times: docs/benchmarks.md; the error is the tolerance of tests/test_lanes.py.

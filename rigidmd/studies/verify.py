@@ -15,7 +15,7 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.engine import EXTERNAL
+from rigidmd.scene.molecules import EXTERNAL
 from rigidmd.scene.stage import Stage
 from rigidmd.studies.export import start_of
 from rigidmd.units import FEMTOSECOND

@@ -18,7 +18,7 @@ from rigidmd.engines.cpu import CompileError
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.lennard_jones import Tail
-from rigidmd.scene.user_code import UserCode, name_of
+from rigidmd.scene.molecules import UserCode, name_of
 from rigidmd.scene.validation import did_you_mean
 
 if TYPE_CHECKING:
