@@ -260,7 +260,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F37", "a force applied to a pinned body: its arm along the body's axes, itself along the lab's",
-        "assemble/body.py",
+        "engines/body_system.py",
         "np.cross(self.centre, self.pose(time, state).rotation.T @ force)",
         "np.cross(self.centre, force)",
         ("test_body_engine.py::test_a_python_function_can_apply_what_a_scene_does",),

@@ -267,8 +267,8 @@ RINGS = [
     Mutation(  # harmless within a run, whose steps count on; a stage that is run alone would repeat the numbers
         "B21", "random numbers of every stage are those of the first",
         "assemble/stage_flows.py",
-        "    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, k)",
-        "    thermal, key = _thermal(stage), key_of(system.scene.seed, BATH, 0)",
+        "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)",
+        "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, 0)",
         ("test_wiring.py::test_stages_have_random_numbers_of_their_own",),
     ),
     Mutation(

@@ -135,7 +135,7 @@ def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
     after, room = strained(system, engine, box, state, strain)
     h = 0.05
     there = prepared(system, engine, box, state, after, room, h)
-    inverse = room.turned[1]
+    inverse = room.matrices[1]
     back = np.array([inverse[i, j] for i, j in COMPONENTS])
     back[:3] = -strain[:3]
     again, other = strained(system, engine, box, after, back)

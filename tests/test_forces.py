@@ -278,7 +278,7 @@ def test_a_list_with_little_room_grows_and_misses_nothing(precision):
         pairs = own.pairs._replace(
             entries=np.empty((blocks, 3), np.uint16),
             masked=np.empty((blocks, 1, 2), np.int32),
-            met=np.empty((blocks, 2), np.int32),
+            neighbors=np.empty((blocks, 2), np.int32),
             origin_vector=np.empty((blocks, 6 if precision == "mixed" else 0), own.pairs.origin_vector.dtype),
         )
         pairs.counters[USABLE] = 0
@@ -307,7 +307,7 @@ def test_lists_begin_with_about_the_room_they_need(edge):
     for pairs, other, own in zip(begun, others, engine.workspaces.values(), strict=True):
         lanes = 4 * len(own.pairs.clusters.order) // len(own.pairs.clusters.origin)
         needed = own.pairs.needed.max(axis=0)
-        for kind, array in ((ENTRIES, pairs.entries), (NEIGHBORS, pairs.met)):
+        for kind, array in ((ENTRIES, pairs.entries), (NEIGHBORS, pairs.neighbors)):
             assert needed[kind] <= 1.1 * array.shape[1] and array.shape[1] < 1.6 * needed[kind] + 16
         if edge:
             window = 3 * lanes * needed[WINDOW]
@@ -634,7 +634,7 @@ def switched_laws(name, start):
 
 def forces_of_products(argon, charges, r):
     """force/r of energies that a switch multiplies, in NumPy."""
-    s, slope = np.array([SWITCH_FUNCTIONS[type(argon.shape)](argon.shape, x) for x in r]).T
+    s, slope = np.array([SWITCH_FUNCTIONS[type(argon.truncation)](argon.truncation, x) for x in r]).T
     of_argon = 2e9 * r**-12 - 3e6 * r**-6, 24e9 * r**-14 - 18e6 * r**-8
     of_charges = 1 / r + charges.field * r**2 + charges.terms[0], r**-3 - 2 * charges.field
     return np.stack([s * w - slope * u / r for u, w in (of_argon, of_charges)], axis=1)

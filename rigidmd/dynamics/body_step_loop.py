@@ -1,5 +1,6 @@
 """The flows of a single body. Each part is chosen by its type, so only what a scene has is compiled."""
 
+# isort: skip_file
 from typing import NamedTuple
 
 from rigidmd.compile import implements, is_a, kernel
@@ -11,13 +12,8 @@ from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_r
 from rigidmd.forces.terms import total_power
 from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, rotate_by_vector
 from rigidmd.mechanics.translation import (
-    FluidTranslation,
-    FreeTranslation,
-    NoTranslation,
-    body_component,
-    inertial_mass,
-    translate,
-)
+    FluidTranslation, FreeTranslation, NoTranslation, body_component, inertial_mass, translate,
+)  # fmt: skip
 
 
 class Body(NamedTuple):

@@ -69,12 +69,12 @@ def run_once(code, name, content, times):
 def entries_that_matter(pairs):
     """Entries of the rows' shells that can hold a site inside the cut-off."""
     found, moved = 0, largest_displacement(pairs)
-    clusters, per_cluster = pairs.clusters, len(pairs.row) * 4 // len(pairs.clusters.origin)
+    clusters, per_cluster = pairs.clusters, len(pairs.row_end) * 4 // len(pairs.clusters.origin)
     for block in range(len(pairs.needed)):
         first = 0
         for r in range(per_cluster * clusters.bounds[block], per_cluster * clusters.bounds[block + 1]):
             found += end_of_row(pairs, r, moved) - first
-            first = pairs.row[r]
+            first = pairs.row_end[r]
     return found
 
 
@@ -148,17 +148,17 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     lanes, useful = lanes_of(term), useful_pairs(term, state)
     forces = milliseconds(run_blocks, code, "forces", content, blocks)
     gather = milliseconds(run_blocks, code, "gather", content, blocks)
-    follow = milliseconds(run_blocks, lists, "follow", pairs, blocks)
-    place = milliseconds(run_blocks, lists, "place", placed, blocks)
+    follow = milliseconds(run_blocks, lists, "displacements", pairs, blocks)
+    place = milliseconds(run_blocks, lists, "local", placed, blocks)
     loads = milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
     build = (  # in their order: each needs what the one before it leaves
         milliseconds(run_blocks, lists, "wrap", placed, blocks)
         + milliseconds(run_blocks, lists, "bin", placed, blocks)
-        + milliseconds(run_once, lists, "prepare", pairs)
-        + milliseconds(run_blocks, lists, "settle", placed, blocks)
+        + milliseconds(run_once, lists, "sort", pairs)
+        + milliseconds(run_blocks, lists, "origins", placed, blocks)
         + place
         + follow
-        + milliseconds(run_once, lists, "grow", pairs)
+        + milliseconds(run_once, lists, "boxes", pairs)
         + milliseconds(run_blocks, lists, "fill", pairs, blocks)
     )
     return {

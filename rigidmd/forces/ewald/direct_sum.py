@@ -16,6 +16,7 @@ only its energy, a constant, has to be subtracted. The cell may have any shape: 
 reciprocal edges.
 """
 
+# isort: skip_file
 from math import pi
 from typing import NamedTuple
 
@@ -27,13 +28,8 @@ from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.ewald.k_vectors import KVectors
 from rigidmd.forces.neighbors.sites import (
-    BodySites,
-    CentralSites,
-    blocks_of,
-    site_tasks,
-    to_molecular_virial,
-    virial_buffer,
-)
+    BodySites, CentralSites, blocks_of, site_tasks, to_molecular_virial, virial_buffer,
+)  # fmt: skip
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
 

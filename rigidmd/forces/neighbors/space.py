@@ -73,7 +73,7 @@ def cell_of(space: Space) -> np.ndarray:
 
 
 def wrap(space: Space, position: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) shifted by whole edges into the cell; unchanged if there is no box."""
+    """Positions (n, 3) shifted by whole edges into the cell; unchanged without a box."""
     if isinstance(space, Unbounded):
         return position
     return position - np.floor(fractions(space, position)) @ cell_of(space)

@@ -77,15 +77,10 @@ class LennardJonesManyKinds(NamedTuple):
 
 
 def lennard_jones(
-    kind: np.ndarray,
-    sigma: np.ndarray,
-    epsilon: np.ndarray,
-    cutoff: float,
-    name: TruncationName = "plain",
-    start: float = 0.0,
-    mixing: Mixing = "lorentz-berthelot",
+    kind: np.ndarray, sigma: np.ndarray, epsilon: np.ndarray, cutoff: float, name: TruncationName = "plain",
+    start: float = 0.0, mixing: Mixing = "lorentz-berthelot",
     special: dict[tuple[int, int], tuple[float, float]] | None = None,
-) -> LennardJones:
+) -> LennardJones:  # fmt: skip
     """The potential for sites of kinds (s,) with sigma (kinds,) in Å and epsilon (kinds,) in u Å²/ps². special : (kind,
     kind) -> (sigma, epsilon), instead of the mixing rule, for both orders of the kinds"""
     truncation = truncation_of(name, cutoff, start)
