@@ -245,6 +245,7 @@ HOMES = {
     "compile.simd": "lane_count",
     "compile.machine": "MOST_THREADS",
     "compile.numba_private": "CacheIndex",
+    "commands.arguments": "read_scene",
     "core.files": "AppendedFile",
     "core.integrators": "DRIFT FORMULATIONS Flow KICK REMOVE_MOMENTUM SCHEMES Solver WITH_THERMOSTAT composed split",
     "core.state": "HEAT Load ORIGIN REMOVED WORK no_load state_of",
@@ -311,7 +312,7 @@ HOMES = {
     "scene.models": (
         "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters with_masses"
     ),
-    "studies.accuracy.averages_report": "brief_rows",
+    "studies.accuracy.averages_report": "brief_rows describe_failures",
     "io.checkpoint": "Checkpoint latest read_checkpoint write_checkpoint",
     "figures.style": "AT_ONCE FAINT INK save_figure shown_range",
     "io.folder": "CHECKPOINT FINAL FolderLock LOG PREVIOUS check_folder",
@@ -366,7 +367,6 @@ RENAMED = {
     "SAMPLE_NUMBERS": "engines.samples:NUMBERS",
     "SHIPPED": "core.shipped:SYSTEMS",
     "draw_analysis_curve": "analysis.files:draw_curve",
-    "averages_failures": "studies.accuracy.averages_report:describe_failures",
     "axis_settings": "studies.sweep.axes:settings",
     "gromacs_unsupported": "engines.gromacs.files:unsupported_features",
     "lennard_jones_energy_and_force": "forces.potentials.lennard_jones:energy_and_force",

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 from support import (
+    AveragedQuantity,
     AverageRun,
     Averages,
-    Quantity,
     brief_rows,
     correlation_time,
+    describe_failures,
     error_of_mean,
     format_signed,
     inefficiency,
     slope,
     small_scene,
 )
-from support import averages_faults as faults
 from support import mean_and_error as mean
 
 from rigidmd import Simulation
@@ -112,10 +112,10 @@ def test_few_independent_values_have_the_error_of_student():
 def test_values_without_an_error_are_printed_as_such():
     assert format_signed(1.5, None) == "+1.5 (too short for an error)" == format_signed(1.5, float("nan"))
     assert format_signed(1.5, 0.25) == "+1.50 ± 0.25"
-    quantities = [Quantity("U", "kJ/mol", 2.5), Quantity("T_trans", "K", 300.0, 300.0)]
+    quantities = [AveragedQuantity("U", "kJ/mol", 2.5), AveragedQuantity("T_trans", "K", 300.0, 300.0)]
     run = AverageRun("baoab", "langevin", 2.0, 500.0, averages={"T_trans": (300.5, 1.0)}, short=["U", "density"])
     found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, quantities, [run])
-    (told,) = faults(found)
+    (told,) = describe_failures(found)
     assert told == (
         "baoab + langevin at 2 fs: U: 5 ps are too short for an error; sample longer (--sample-ps)"
     )  # of what is reported

@@ -19,9 +19,9 @@ def add(commands: Commands) -> None:
 
 
 def _film(options: argparse.Namespace) -> int:
-    from rigidmd.view.film import ENDINGS, check_writer, default_name, write_film
+    from rigidmd.view.animation import EXTENSIONS, check_writer, default_name, write_film
 
-    path = file_about_run(options, default_name(), ENDINGS)
+    path = file_about_run(options, default_name(), EXTENSIONS)
     check_writer(path)
     with progress_bar() as bar:
         progress = lambda fraction: bar.update(fraction - bar.n)  # noqa: E731

@@ -20,10 +20,10 @@ def add(commands: Commands) -> None:
 
 def _gallery(options: argparse.Namespace) -> int:
     from rigidmd.io.write import check_target
-    from rigidmd.view.gallery import INDEX, chosen, write_gallery
+    from rigidmd.view.gallery import INDEX, selected_bodies, write_gallery
 
     folder = Path(options.output)
-    bodies = chosen(options.names)
+    bodies = selected_bodies(options.names)
     if folder.is_dir():
         for name in (INDEX, *(f"{body.name}.html" for body in bodies)):
             check_target(folder / name, (".html",), options.force)

@@ -24,7 +24,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    from rigidmd.view.film_page import VIEW, write_view
+    from rigidmd.view.animation_page import VIEW, write_view
 
     print_page(*write_view(Path(options.folder), file_about_run(options, VIEW, (".html",))))
     return 0

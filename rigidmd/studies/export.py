@@ -16,7 +16,7 @@ from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.io.write import writing
 from rigidmd.run import MolecularSimulation
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.engine import EngineChoice
+from rigidmd.scene.molecules import EngineChoice
 
 #: File that lists what an export wrote in its folder; --force replaces the files of an export only.
 MARKER = ".rigidmd-export"

@@ -228,18 +228,13 @@ def averages_page(found: Averages, command: str) -> str:
     runs = [[colored[run.method], *line[1:]] for run, line in zip(found.runs, brief_rows(found), strict=True)]
     about = f"{found.molecules} molecules, {found.freedom} degrees of freedom, {found.stage} at {found.temperature:g} K"
     note = f"{BIAS_LIMIT:.0%} is of {', '.join(of)}. Where none was seen, > gives the step up to which it is smaller"
+    steps = table(["method", *(q.name for q in judged)], rows), items([note, *describe_references(found)])
+    all_runs = table(brief_headers(found), runs), items(describe_failures(found))
     parts = [
         f'<p class="faint">{plain(about)}; {found.sampled:g} ps at every step</p>',
-        section(
-            f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}",
-            table(["method", *(q.name for q in judged)], rows),
-            items([note, *describe_references(found)]),
-        ),
+        section(f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}", *steps),
         section("Bias against the time step", wide(figure_of(found), "averages", "biases over time steps")),
-        section(
-            "All runs: biases, U in kT per degree of freedom",
-            table(brief_headers(found), runs),
-            items(describe_failures(found)),
-        ),
+        section("All runs: biases, U in kT per degree of freedom", *all_runs),
+        section("How to repeat it", code(command)),
     ]
-    return page(f"{found.name}: bias of averages", [*parts, section("How to repeat it", code(command))])
+    return page(f"{found.name}: bias of averages", parts)

@@ -101,28 +101,17 @@ def run_body(
 
 
 def molecules_scene(
-    molecules: list[dict],
-    box: dict,
-    step: float,
-    steps: int,
-    family: str = SPLIT,
-    temperature: float | None = 298.0,
-    thermostat: dict | None = None,
-    forces: dict | None = None,
-    samples: int = 25,
-) -> dict:
+    molecules: list[dict], box: dict, step: float, steps: int, family: str = SPLIT, temperature: float | None = 298.0,
+    thermostat: dict | None = None, forces: dict | None = None, samples: int = 25,
+) -> dict:  # fmt: skip
     """The tables of a scene of molecules: one stage of `steps` steps (fs), sampled `samples` times, no files."""
     stage = {"duration_ps": step * steps / 1000, "timestep_fs": float(step)} | FAMILIES[family]
     if thermostat is not None:
         stage |= {"ensemble": "nvt"} | thermostat
-    return {
-        "box": box,
-        "molecules": molecules,
-        "forces": forces or {},
-        "start": {} if temperature is None else {"temperature_K": float(temperature)},
-        "stages": [stage],
-        "output": {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // samples) / 1000)},
-    }
+    start = {} if temperature is None else {"temperature_K": float(temperature)}
+    output = {"trajectory": False, "log_interval_ps": min(1e9, step * max(1, steps // samples) / 1000)}
+    scene = {"box": box, "molecules": molecules, "forces": forces or {}, "start": start, "stages": [stage]}
+    return scene | {"output": output}
 
 
 def molecular_scene(data: dict) -> MolecularScene:

@@ -76,23 +76,14 @@ def no_numbers(result: CaseResult, quick: bool) -> None:
     """NaN and infinity in place of every number of a scene of molecules, of a body, and in structures."""
     heat = {"temperature_K": 300.0, "thermostat_time_ps": 0.1}
     molecules = molecules_scene([bent() | {"count": 8}], BOX, 1.0, 10, SPLIT, 300.0, heat, FORCES | {"skin_A": 1.0})
-    body = body_scene(
-        {
-            "body": {
-                "mass_kg": 1.0,
-                "inertia_kg_m2": [1.0, 1.5, 2.0],
-                "pinned": True,
-                "centre_of_mass_m": [0.0, 0.1, 0.2],
-            },
-            "start": {"euler_angles_deg": [1.0, 2.0, 3.0], "angular_velocity_body_rad_s": [1.0, 2.0, 3.0]},
-            "gravity": {"acceleration_m_s2": [0.0, 0.0, -9.81]},
-            "friction": {"viscous_N_m_s": [0.1, 0.1, 0.1], "dry_N_m": [0.1, 0.1, 0.1]},
-            "applied": [{"torque_N_m": [0.1, 0.2, 0.3], "from_s": 0.1, "to_s": 0.2}],
-        },
-        0.01,
-        1.0,
-        EXACT,
-    )
+    tables = {
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.5, 2.0], "pinned": True, "centre_of_mass_m": [0.0, 0.1, 0.2]},
+        "start": {"euler_angles_deg": [1.0, 2.0, 3.0], "angular_velocity_body_rad_s": [1.0, 2.0, 3.0]},
+        "gravity": {"acceleration_m_s2": [0.0, 0.0, -9.81]},
+        "friction": {"viscous_N_m_s": [0.1, 0.1, 0.1], "dry_N_m": [0.1, 0.1, 0.1]},
+        "applied": [{"torque_N_m": [0.1, 0.2, 0.3], "from_s": 0.1, "to_s": 0.2}],
+    }
+    body = body_scene(tables, 0.01, 1.0, EXACT)
     for setting, data in (("molecules", molecules), ("body", body)):
         for keys in numbers(data):
             for value in (nan, inf, -inf):

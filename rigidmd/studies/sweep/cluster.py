@@ -65,14 +65,9 @@ class Cluster:
     def submit(self, task: PointTask) -> None:
         name = task["name"]
         future = self._client.submit(
-            _run_on_worker,
-            task,
-            self._threads,
-            self._topic,
-            self._working_directory,
-            key=f"{self._topic}-{name}-{next(_COUNT)}",
-            pure=False,
-        )
+            _run_on_worker, task, self._threads, self._topic, self._working_directory,
+            key=f"{self._topic}-{name}-{next(_COUNT)}", pure=False,
+        )  # fmt: skip
         self._futures[name] = future
         future.add_done_callback(lambda done: self._heard.put((name, self._end_message(done))))
 

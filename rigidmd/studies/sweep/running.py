@@ -42,13 +42,9 @@ class SweepOutcome:
 
 
 def run_points(
-    folder: Path,
-    manifest: Manifest,
-    runner: Runner,
-    walltime: float | None = None,
-    trust: Sequence[str] = (),
+    folder: Path, manifest: Manifest, runner: Runner, walltime: float | None = None, trust: Sequence[str] = (),
     receive: Callable[[str, str, Any], object] = lambda name, kind, value: None,
-) -> SweepOutcome:
+) -> SweepOutcome:  # fmt: skip
     """Run what is not finished. A point waits while one that compiles the same code has not begun.
 
     walltime : seconds after which all has to have ended

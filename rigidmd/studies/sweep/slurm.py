@@ -45,20 +45,13 @@ def write_script(
     here = str(Path.cwd())
     check_script_paths([*words, str(path), here])
     text = JOB.format(
-        count=len(left),
-        name=in_comment(manifest.name),
-        job=f"{as_word(manifest.name)}-sweep",
-        array=format_ranges(left),
-        time=format_walltime(walltime),
+        count=len(left), name=in_comment(manifest.name), job=f"{as_word(manifest.name)}-sweep",
+        array=format_ranges(left), threads=threads, time=format_walltime(walltime),
         inner=format_walltime(walltime - min(SPARE, SPARE_FRACTION * walltime)),
-        threads=threads,
         folder=str(folder.absolute()).replace("%", "%%"),  # Slurm replaces %j and others
-        here=shlex.quote(here),
-        point=shlex.join(words),
-        collect=shlex.join([*words, "--collect"]),
-        script=shlex.quote(str(path)),
-        again=again,
-    )
+        here=shlex.quote(here), script=shlex.quote(str(path)), again=again,
+        point=shlex.join(words), collect=shlex.join([*words, "--collect"]),
+    )  # fmt: skip
     write_text(path, text)
     return path, len(left)
 
