@@ -279,14 +279,14 @@ class _Assembly(NamedTuple):
         position = atoms.positions @ rotation.T
         found = refit(position, self.matched, self.species, cell)
         has_rotations = len(self.system.state.rotation) > 0
-        state = state_of(found.centre, None, found.rotation if has_rotations else None, None, cell)
+        state = state_of(found.fit.centre, None, found.fit.rotation if has_rotations else None, None, cell)
         given = position[self.order]
         whole = given
         if cell is not None:
             whole = given - np.rint((given - self.rigid(state)) @ np.linalg.inv(cell)) @ cell
         radius = np.array([m.radius if len(massive_sites(m)) > 1 else np.inf for m in self.species])[found.species]
-        bent = found.deviation / radius
-        return _FittedAtoms(self, state, rotation, whole, given, float(found.deviation.max()), float(bent.max()))
+        bent = found.fit.deviation / radius
+        return _FittedAtoms(self, state, rotation, whole, given, float(found.fit.deviation.max()), float(bent.max()))
 
     def rigid(self, state: State) -> np.ndarray:
         """Positions (a, 3) of the sites with mass."""

@@ -483,7 +483,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         ({"restraints": [HELD]}, {"molecules": [{"model": "spce", "count": 2}, {"model": "argon", "count": 2}]},
          "fields.restraints.0.species is required: there are spce, argon"),
         ({"restraints": [HELD | {"molecules": "1-2"}]}, {"molecules": [{"model": "spce", "count": 5, "frozen": [2]}]},
-         "fields.restraints.0.molecules: frozen ones are among 1-2"),
+         "fields.restraints.0.molecules: 1-2 includes frozen molecules"),
         ({"restraints": [HELD]}, {"run": {"remove_momentum_interval_ps": 1.0}},
          "run.remove_momentum_interval_ps: fields or frozen molecules change all components"),
     ],

@@ -29,7 +29,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import Forces, default_switch_start
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.molecules import WITH_VELOCITIES, Output
+from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.scene.stage import Stage
 
 #: Default thermostat of external engines, because neither LAMMPS nor OpenMM has velocity rescaling of rigid bodies.
@@ -124,9 +124,13 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
         numbers |= found
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
         faults.append("output.pressure_tensor_interval_ps needs a periodic box: without one there is no pressure")
+    output = scene.output
+    if output.velocities is None:
+        can_store = bool(output.trajectory) and output.trajectory.endswith(WITH_VELOCITIES)
+        output = output.model_copy(update={"velocities": can_store})
     tables = {
         "forces": scene.forces.model_copy(update=numbers),
-        "output": _output(scene.output),
+        "output": output,
         "stages": tuple(stage_with_defaults(scene, stage) for stage in scene.stages),
     }
     # The folder of a run has a copy of the file under another name, which must not rename the species.
@@ -154,13 +158,6 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     removed = scene.forces.electrostatics == "pme" and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
-
-
-def _output(output: Output) -> Output:
-    if output.velocities is not None:
-        return output
-    holds = bool(output.trajectory) and output.trajectory.endswith(WITH_VELOCITIES)
-    return output.model_copy(update={"velocities": holds})
 
 
 def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[str, Any], list[str]]:

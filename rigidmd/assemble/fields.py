@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.species import select_by_number
 from rigidmd.core.state import State
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import conserved_momentum
@@ -155,15 +156,12 @@ def _restraints(scene: MolecularScene, k: int, parts: SystemParts, faults: list[
         return None
     moves = parts.model.inverse_mass[index] > 0
     restrained = of_species & moves if entry.molecules is None else np.zeros(len(index), bool)
-    for first, last in entry.spans:
-        selected = of_species & (first <= number) & (number <= last)
-        numbers = f"{first}" if first == last else f"{first}-{last}"
-        if not selected.any() or last > number[of_species].max():
-            there = f"they have {number[of_species].min()} to {number[of_species].max()}"
-            faults.append(f"{key}.molecules: no {name} has the number {numbers}; {there}")
-        elif not moves[selected].all():
+    for numbers, mask, fault in select_by_number(entry.spans, name, of_species, number):
+        if fault:
+            faults.append(f"{key}.molecules: {fault}")
+        elif not moves[mask].all():
             faults.append(f"{key}.molecules: {numbers} includes frozen molecules, which do not move")
-        restrained |= selected
+        restrained |= mask
     if not restrained.any():
         if entry.molecules is None:
             faults.append(f"{key} would do nothing: all {name} are frozen")

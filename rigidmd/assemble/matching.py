@@ -41,10 +41,7 @@ class MatchedMolecules(NamedTuple):
 
     species: np.ndarray  # (n,)
     atoms: list[np.ndarray]  # atoms of each molecule, in the order of its sites with mass
-    centre: np.ndarray  # (n, 3) Å
-    rotation: np.ndarray  # (n, 3, 3)
-    deviation: np.ndarray  # (n,) Å
-    square: np.ndarray  # (n,) Å²
+    fit: TemplateFit  # of the n molecules
     massless: Counter  # number of massless atoms in the file, by name
     notes: list[str]
     number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
@@ -90,13 +87,13 @@ def refit(
     position: np.ndarray, matched: MatchedMolecules, species: list[Molecule], cell: np.ndarray | None
 ) -> MatchedMolecules:
     """The same molecules fitted to new positions (a, 3) of their atoms, for any deviation."""
-    centre, rotation = np.zeros_like(matched.centre), np.zeros_like(matched.rotation)
-    deviation, square = np.zeros_like(matched.deviation), np.zeros_like(matched.square)
+    fit = TemplateFit(*map(np.zeros_like, matched.fit))
     for k in np.unique(matched.species):
         members = np.flatnonzero(matched.species == k)
         points = _make_whole(position[np.array([matched.atoms[m] for m in members])], cell)
-        centre[members], rotation[members], deviation[members], square[members] = _fit(points, species[k])
-    return matched._replace(centre=centre, rotation=rotation, deviation=deviation, square=square)
+        for array, values in zip(fit, _fit(points, species[k]), strict=True):
+            array[members] = values
+    return matched._replace(fit=fit)
 
 
 def _labels(molecule: Molecule) -> list[str]:
@@ -220,10 +217,8 @@ def _match_groups(
         key = (residue[1] if residue else "", tuple(atoms.names[i] for i in run), tuple(kinds[i] for i in run))
         alike.setdefault(key, []).append(number)
     n = len(runs)
-    found = MatchedMolecules(
-        species=np.full(n, -1), atoms=[np.zeros(0, int)] * n, centre=np.zeros((n, 3)), rotation=np.zeros((n, 3, 3)),
-        deviation=np.zeros(n), square=np.zeros(n), massless=Counter(), notes=[],
-    )  # fmt: skip
+    fit = TemplateFit(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n))
+    found = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, massless=Counter(), notes=[])
     faults = {}
     for (residue, names, run_kinds), members in alike.items():
         named = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
@@ -317,8 +312,8 @@ def _fit_group(
             order, fit = fits[fitting[0]]
             found.species[m] = candidates[fitting[0]].species
             found.atoms[m] = order[row]
-            found.centre[m], found.rotation[m] = fit.centre[row], fit.rotation[row]
-            found.deviation[m], found.square[m] = fit.deviation[row], fit.square[row]
+            for array, values in zip(found.fit, fit, strict=True):
+                array[m] = values[row]
         elif fitting:
             names = " or ".join(species[candidates[k].species].name for k in fitting)
             faults[m] = f"may be {names}: give them residue_names in the scene"

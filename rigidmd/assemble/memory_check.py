@@ -32,23 +32,30 @@ BYTES_PER_LOG_LINE, BYTES_PER_FRAME = 870, 150
 ADVICE = "take fewer molecules, a smaller box or a shorter cutoff"
 
 
+def _require(source: str, needed: float, what: str, advice: str) -> None:
+    """Raise SceneError if a number of bytes exceeds the free memory."""
+    if fault := memory_shortage(needed, what):
+        raise SceneError(source, [f"not enough memory: {fault}: {advice}"])
+
+
 def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
-    """Raise SceneError if these numbers of molecules and sites in all exceed the memory."""
+    """Raise SceneError if these numbers of molecules and of all their sites exceed the memory."""
     needed = BYTES_PER_MOLECULE * molecules + BYTES_PER_SITE * sites
-    if fault := memory_shortage(needed, f"a system of {molecules} molecules with {sites} sites"):
-        raise SceneError(source, [f"not enough memory: {fault}: take fewer molecules"])
+    _require(source, needed, f"a system of {molecules} molecules with {sites} sites", "take fewer molecules")
 
 
 def check_memory_of_samples(scene: BodyScene) -> None:
     """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
     run, interval = scene.run, not_none(scene.output.interval_s)
     samples = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
-    if fault := memory_shortage(BYTES_PER_SAMPLE * samples, f"a run with {samples:.3g} samples"):
-        raise SceneError(scene.source, [f"not enough memory: {fault}: lengthen output.interval_s"])
+    _require(
+        scene.source, BYTES_PER_SAMPLE * samples, f"a run with {samples:.3g} samples", "lengthen output.interval_s"
+    )
 
 
 def check_memory(system: "System") -> None:
     """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids, samples."""
+    source, output = system.scene.source, system.scene.output
     try:
         needed = bytes_of(system)
     except MemoryError as error:  # of NumPy, with the shape of the array
@@ -56,13 +63,11 @@ def check_memory(system: "System") -> None:
         needed = max(prod(shape) * np.dtype(dtype).itemsize, int(free_memory()))
         free = format_gigabytes(free_memory())
         fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {free} free"
-        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {ADVICE}"]) from None
-    kept, count = bytes_of_samples(system), observation_count(system, system.scene.output.log_interval_ps)
-    if fault := memory_shortage(kept, f"a run with {count:.3g} lines in its log"):
-        longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
-        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {longer}"])
-    if fault := memory_shortage(needed, "the run"):
-        raise SceneError(system.scene.source, [f"not enough memory: {fault}: {ADVICE}"])
+        raise SceneError(source, [f"not enough memory: {fault}: {ADVICE}"]) from None
+    lines = f"a run with {observation_count(system, output.log_interval_ps):.3g} lines in its log"
+    longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
+    _require(source, bytes_of_samples(system), lines, longer)
+    _require(source, needed, "the run", ADVICE)
 
 
 def observation_count(system: "System", interval: float) -> float:

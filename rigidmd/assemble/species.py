@@ -1,5 +1,6 @@
 """The species of a scene: their rigid molecules, and which molecules are frozen."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,22 @@ def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ..
     return with_parameters(tuple(sites), table)
 
 
+def select_by_number(
+    ranges: list[tuple[int, int]], name: str, of_species: np.ndarray, number: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, str]]:
+    """For each range of molecule numbers of a species: its text, its mask (n,), and a message on missing numbers."""
+    for first, last in ranges:
+        text, mask = (
+            f"{first}" if first == last else f"{first}-{last}",
+            of_species & (first <= number) & (number <= last),
+        )
+        fault, present = "", number[of_species]
+        if not mask.any() or last > present.max():
+            there = f"they have {present.min()} to {present.max()}" if len(present) else "there are none"
+            fault = f"no {name} has the number {text}; {there}"
+        yield text, mask, fault
+
+
 def split_frozen(
     scene: MolecularScene, species: list[Molecule], index: np.ndarray, number: np.ndarray
 ) -> tuple[list[Molecule], np.ndarray, np.ndarray, list[str]]:
@@ -89,17 +106,9 @@ def split_frozen(
     for k, entry in enumerate(scene.molecules):
         of_species = index == k
         selected = np.zeros(len(index), bool)
-        for first, last in entry.frozen_spans:
-            in_range = of_species & (first <= number) & (number <= last)
-            if not in_range.any() or last > number[of_species].max():
-                there = (
-                    f"they have {number[of_species].min()} to {number[of_species].max()}"
-                    if of_species.any()
-                    else "there are none"
-                )
-                numbers = f"{first}" if first == last else f"{first}-{last}"
-                faults.append(f"molecules.{k}.frozen: no {species[k].name} has the number {numbers}; {there}")
-            selected |= in_range
+        for _, mask, fault in select_by_number(entry.frozen_spans, species[k].name, of_species, number):
+            faults += [f"molecules.{k}.frozen: {fault}"] if fault else []
+            selected |= mask
         if selected.any() and (selected == of_species).all():
             frozen[k] = True
         elif selected.any():

@@ -171,10 +171,10 @@ def _read_molecules(
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
     return Configuration(
-        species=matched.species, position=matched.centre, rotation=matched.rotation, velocity=velocity,
+        species=matched.species, position=matched.fit.centre, rotation=matched.fit.rotation, velocity=velocity,
         angular_momentum_body=angular, cell=atoms.cell,
-        residual_rms=float(np.sqrt(matched.square @ sizes / sizes.sum())),
-        residual_max=float(matched.deviation.max()), number=matched.number, notes=tuple(notes),
+        residual_rms=float(np.sqrt(matched.fit.square @ sizes / sizes.sum())),
+        residual_max=float(matched.fit.deviation.max()), number=matched.number, notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -272,7 +272,7 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
         masses = molecule.masses[sites]
         v = atoms.velocity[np.array([matched.atoms[m] for m in members])]
         velocity[members] = np.einsum("s,nsk->nk", masses, v) / masses.sum()
-        rotation = matched.rotation[members]
+        rotation = matched.fit.rotation[members]
         arm = np.einsum("nij,sj->nsi", rotation, molecule.positions_body[sites])
         lab = np.einsum("s,nsk->nk", masses, np.cross(arm, v - velocity[members][:, None]))
         angular[members] = np.einsum("nij,ni->nj", rotation, lab) * (molecule.inertia > 0)

@@ -14,19 +14,15 @@ KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
 Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
+EWALD_METHODS = ("ewald", "pme")
 #: Keys of `Forces` -> the methods of electrostatics that use them.
 ELECTROSTATIC_KEYS = {
     "reaction_field_permittivity": ("reaction_field",),
     "damping_per_A": ("damped_shifted_force",),
-    "ewald_accuracy": ("ewald", "pme"),
-    "ewald_alpha_per_A": ("ewald", "pme"),
-    "ewald_surface_permittivity": ("ewald", "pme"),
-    "ewald_truncation": ("ewald", "pme"),
-    "ewald_k_max": ("ewald",),
-    "ewald_k2_max": ("ewald",),
-    "ewald_k_radius_per_A": ("ewald",),
-    "pme_order": ("pme",),
-    "pme_grid": ("pme",),
+    **dict.fromkeys(("ewald_accuracy", "ewald_alpha_per_A", "ewald_surface_permittivity"), EWALD_METHODS),
+    "ewald_truncation": EWALD_METHODS,
+    **dict.fromkeys(("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A"), ("ewald",)),
+    **dict.fromkeys(("pme_order", "pme_grid"), ("pme",)),
 }
 
 

@@ -193,11 +193,11 @@ class Molecule:
     def description(self) -> str:
         """Kind of body, number of sites, mass, charge and dipole, for reports."""
         shape = f"{self.kind}, planar" if self.planar else self.kind
-        charge = f"net charge {self.charge:+g} e" if self.charge else "neutral"
+        charge, count = f"net charge {self.charge:+g} e" if self.charge else "neutral", len(self.masses)
         dipole = ""
         if self.charges.any() and self.radius > 0:
             dipole = f", dipole {self.dipole_debye:.3f} D" if self.has_dipole else ", no dipole"
-        return f"{shape}, {_counted(len(self.masses), 'site')}, {self.mass:.4f} u, {charge}{dipole}"
+        return f"{shape}, {count} site{'' if count == 1 else 's'}, {self.mass:.4f} u, {charge}{dipole}"
 
     @property
     def radius(self) -> float:
@@ -223,10 +223,6 @@ class Molecule:
         return entries
 
 
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def molecule(
     name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
 ) -> Molecule:
@@ -247,20 +243,14 @@ def molecule(
     body = (positions - frame.centre) @ frame.axes
     near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
     faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
-    if frame.kind == "point" and not faults:
-        off = np.linalg.norm(body, axis=1)
-        faults += [
-            f"site {s.name} is {d:.3g} Å from the centre of mass, but all the mass is there: nothing resists its torque"
-            for s, d in zip(sites, off, strict=True)
-            if d > OFF_AXIS * size
-        ]
-    if frame.kind == "linear":
-        off = np.linalg.norm(body[:, 1:], axis=1)
-        faults += [
-            f"site {s.name} is {d:.3g} Å off the axis of a linear body: nothing resists its torque about that axis"
-            for s, d in zip(sites, off, strict=True)
-            if d > OFF_AXIS * size
-        ]
+    if frame.kind == "linear" or (frame.kind == "point" and not faults):
+        off = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1)
+        where = {
+            "linear": "off the axis of a linear body: nothing resists its torque about that axis",
+            "point": "from the centre of mass, but all the mass is there: nothing resists its torque",
+        }[frame.kind]
+        limit = OFF_AXIS * size
+        faults += [f"site {s.name} is {d:.3g} Å {where}" for s, d in zip(sites, off, strict=True) if d > limit]
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
     if frame.kind == "point":

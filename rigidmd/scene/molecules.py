@@ -324,21 +324,19 @@ class MolecularScene(Scene):
 
     def _barostat_faults(self) -> list[str]:
         """Messages on stages with a barostat."""
-        faults = []
-        for k, stage in enumerate(self.stages):
-            if not stage.changes_box:
-                continue
-            given = " with pressure_bar" if stage.is_minimisation else ""
-            where = f"stages.{k}: {stage.ensemble}{given} changes the box,"
-            if not self.box.periodic:
-                faults.append(f"{where} but box.periodic is false")
-            if any(species.frozen for species in self.molecules):
-                faults.append(f"{where} but frozen molecules do not move: release them, or keep the volume")
-            if self.fields.walls:
-                faults.append(f"{where} but fields.walls do not move: keep the volume")
-            if self.fields.restraints:
-                faults.append(f"{where} but fields.restraints fix positions: keep the volume")
-        return faults
+        reasons = {
+            "box.periodic is false": not self.box.periodic,
+            "frozen molecules do not move: release them, or keep the volume": any(m.frozen for m in self.molecules),
+            "fields.walls do not move: keep the volume": self.fields.walls,
+            "fields.restraints fix positions: keep the volume": self.fields.restraints,
+        }
+        return [
+            f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box, but {reason}"
+            for k, stage in enumerate(self.stages)
+            if stage.changes_box
+            for reason, applies in reasons.items()
+            if applies
+        ]
 
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
         """Notes on intervals and durations that are not a whole number of steps, of all stages or these."""
@@ -386,23 +384,19 @@ class MolecularScene(Scene):
 
     @classmethod
     def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        named = []
-        if isinstance(structure := data.get("structure"), dict):
-            named += [(f"structure.{key}", structure.get(key)) for key in ("file", "topology")]
-        if isinstance(species := data.get("molecules"), list):
-            named += [
-                (f"molecules.{k}.{key}", entry.get(key))
-                for k, entry in enumerate(species)
-                if isinstance(entry, dict)
-                for key in SPECIES_FILES
-            ]
         forces = data.get("forces")
-        if isinstance(custom := forces.get("custom") if isinstance(forces, dict) else None, list):
-            named += [
-                (f"forces.custom.{k}.module", entry.get("module"))
-                for k, entry in enumerate(custom)
-                if isinstance(entry, dict)
+        custom = forces.get("custom") if isinstance(forces, dict) else None
+        tables = [("structure", data.get("structure"), ("file", "topology"))]
+        for name, entries, keys in (
+            ("molecules", data.get("molecules"), SPECIES_FILES),
+            ("forces.custom", custom, ("module",)),
+        ):
+            tables += [
+                (f"{name}.{k}", entry, keys) for k, entry in enumerate(entries if isinstance(entries, list) else ())
             ]
+        named = [
+            (f"{name}.{key}", table.get(key)) for name, table, keys in tables if isinstance(table, dict) for key in keys
+        ]
         return [
             f"{key}: {shorten_repr(file)} is outside the scene's folder; move it there, or set it by --set {key}=PATH"
             for key, file in named
