@@ -190,20 +190,20 @@ def _kick_translation(resistance, translation, rotor, frame, state, load, h):
 
 
 @kernel
-def resisted_motion(speed, kick_with_resistance, dry, linear, h):
+def resisted_motion(speed, push, dry, linear, h):
     """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0. Dry
     friction stops the motion in a finite time, and holds the body at rest unless the push is stronger."""
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:
-        if abs(kick_with_resistance) <= dry:
+        if abs(push) <= dry:
             return 0.0, 0.0
-        sign = copysign(1.0, kick_with_resistance)
-    net = sign * kick_with_resistance - dry
+        sign = copysign(1.0, push)
+    net = sign * push - dry
     if net < 0.0:
         rest = log1p(linear * s / -net) / linear if linear > 0.0 else s / -net
         if rest <= h:  # the body stops, and the push may then reverse the motion
-            back = max(0.0, abs(kick_with_resistance) - dry) if sign * kick_with_resistance < 0.0 else 0.0
+            back = max(0.0, abs(push) - dry) if sign * push < 0.0 else 0.0
             there = drag_integrals(linear, rest)
             after, way = linear_drag_motion(0.0, back, linear, h - rest)
             return -sign * after, sign * (s * there[0] + net * there[1] - way)

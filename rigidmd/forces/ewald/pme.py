@@ -133,20 +133,13 @@ class PmeWorkspace(NamedTuple):
 
     def with_code(self) -> "PmeWorkspace":
         content = (self.alpha, self.charge, self.spline, self.mesh)
-        tasks = (
-            _set_influence,
-            _scale_positions,
-            _sort_sites,
-            _spread_charges,
-            _convolve,
-            _convolve_with_virial,
-            _transform_back,
-            _interpolate_forces,
-        )
-        names = ("influence", "scale", "sort", "spread", "convolve", "convolve_with_virial", "back", "forces")
-        found = {name: (one, content) for name, one in zip(names, tasks, strict=True)}
+        tasks = {
+            "influence": _set_influence, "scale": _scale_positions, "sort": _sort_sites, "spread": _spread_charges,
+            "convolve": _convolve, "convolve_with_virial": _convolve_with_virial, "back": _transform_back,
+            "forces": _interpolate_forces,
+        }  # fmt: skip
         moved = site_tasks(self.sites, self.mesh.position, self.mesh.force, self.mesh.virial)
-        return self._replace(code=Code(**found, **moved))
+        return self._replace(code=Code(**{name: (one, content) for name, one in tasks.items()}, **moved))
 
 
 @implements(terms.add_forces, PmeWorkspace, count_references=False)

@@ -73,12 +73,12 @@ def _molecules_of_block(sites, blocks, block):
 
 
 @kernel(count_references=False)
-def wrap_sites_of_block(clusters, cell, sites, state, lead, largest_displacement, block):
+def wrap_sites_of_block(clusters, cell, sites, state, lead, max_distance, block):
     """Write positions in the brick of the sites of a block of molecules into `local`, for `bin_sites_of_block`.
 
     The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
     positions are predicted for a time `lead` ahead, see `predict_site`. `extent` gets their extent, or NaN if a
-    coordinate is farther from the origin than `largest_displacement`, or is not finite.
+    coordinate is farther from the origin than `max_distance`, or is not finite.
     """
     extent, local = clusters.extent[block], clusters.local
     for k in range(3):
@@ -87,7 +87,7 @@ def wrap_sites_of_block(clusters, cell, sites, state, lead, largest_displacement
     for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
             at = _ahead(sites, state, m, i, lead)
-            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < largest_displacement:
+            if not abs(at[0]) + abs(at[1]) + abs(at[2]) < max_distance:
                 extent[0] = nan
                 return
             _count_boxes(clusters.boxes, cell, i, at)

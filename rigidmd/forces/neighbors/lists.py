@@ -256,10 +256,10 @@ def largest_displacement(pairs):
 
 
 @kernel(inline=True)
-def end_of_row(pairs, r, largest_displacement):
-    """End of the entries of row r that can have a site inside the cutoff; `largest_displacement` as above, Å."""
+def end_of_row(pairs, r, displacement):
+    """End of the entries of row r that can have a site inside the cutoff; `displacement` as above, Å."""
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
-    shell = min(SHELLS - 1, ceil((moved + largest_displacement) * pairs.shells_per_A))
+    shell = min(SHELLS - 1, ceil((moved + displacement) * pairs.shells_per_A))
     return pairs.row_end[r] - pairs.beyond[r, shell]
 
 

@@ -459,13 +459,9 @@ def _with_product(virial, force, at):
     """A symmetric virial, six vectors, with force (x) position added."""
     x, y, z = force
     return (
-        virial[0] + x * at[0],
-        virial[1] + x * at[1],
-        virial[2] + x * at[2],
-        virial[3] + y * at[1],
-        virial[4] + y * at[2],
-        virial[5] + z * at[2],
-    )
+        virial[0] + x * at[0], virial[1] + x * at[1], virial[2] + x * at[2],
+        virial[3] + y * at[1], virial[4] + y * at[2], virial[5] + z * at[2],
+    )  # fmt: skip
 
 
 @kernel(inline=True)

@@ -29,8 +29,8 @@ class Scratch(NamedTuple):
     family: np.ndarray  # (capacity,) families of clusters near some clusters, as IMAGES * family + number of the image
     candidate: np.ndarray  # (capacity + arity,) images of clusters that may be neighbours; finally the neighbours
     close: np.ndarray  # (capacity,) those of them that may need a mask
-    kind: np.ndarray  # (capacity * rows,) uint8 shell of entry n in row k of the cluster, at n * rows + k
-    kind_end: np.ndarray  # (rows of a cluster, KINDS) number of entries of each kind, later the index of the next one
+    kind: np.ndarray  # ((capacity + 1) * rows,) uint8 kind of candidate n in row k of the cluster, at n * rows + k
+    kind_end: np.ndarray  # (rows, KINDS) uint32 entries of each kind, then the next index (unsigned: not tested)
     sorted: np.ndarray  # (rows of a cluster, capacity) uint16 entries in the order of their kinds
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
@@ -39,17 +39,11 @@ class Scratch(NamedTuple):
 def _new_scratch(pairs, capacity):
     rows = lanes_of(pairs.clusters.local) // 2
     return Scratch(
-        np.empty((len(pairs.tree.level), 2), np.int64),
-        np.empty(3),
-        np.empty(3),
-        np.empty(capacity, np.int64),
-        np.empty(capacity + lanes_of(pairs.tree.low), np.int64),
-        np.empty(capacity, np.int64),
-        np.empty(rows * (capacity + 1), np.uint8),  # one more, since a candidate that no row needs is written too
-        np.empty((rows, KINDS), np.uint32),  # unsigned: no index is checked for being negative
-        np.empty((rows, capacity), np.uint16),
-        np.zeros(5, np.int64),
-    )
+        np.empty((len(pairs.tree.level), 2), np.int64), np.empty(3), np.empty(3), np.empty(capacity, np.int64),
+        np.empty(capacity + lanes_of(pairs.tree.low), np.int64), np.empty(capacity, np.int64),
+        np.empty(rows * (capacity + 1), np.uint8), np.empty((rows, KINDS), np.uint32),
+        np.empty((rows, capacity), np.uint16), np.zeros(5, np.int64),
+    )  # fmt: skip
 
 
 @kernel(inline=True)
