@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import pytest
 from pydantic import BaseModel
-from support import CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters
+from support import CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters, read_scene
 
 import rigidmd
 from rigidmd.commands import cli
@@ -180,12 +180,12 @@ class Reader:
 def parse(arguments: list[str]) -> argparse.Namespace:
     """The options of a command line, its scene read with them if it is there. Fails where the commands would."""
     try:
-        options = cli._parsed(arguments)
+        options = cli._parse(arguments)
     except SystemExit as error:
         pytest.fail(f"rigidmd {shlex.join(arguments)}: exit code {error.code}")
     scene = getattr(options, "scene", None)
     if scene is not None and Path(scene).suffix == ".toml" and Path(scene).exists():
-        cli._read_scene(options)
+        read_scene(options)
     return options
 
 
