@@ -23,11 +23,11 @@ from support import (
     Molecule,
     Site,
     TrajectoryFile,
-    describe_basis,
     basis_of,
     build,
     built,
     close_pairs,
+    describe_basis,
     element_of,
     element_of_mass,
     every_site,
@@ -255,9 +255,9 @@ REFERENCE = [
         "structures/ice_XI_like_8water_P1.cif", "spce", None,
         8, density(8, WATER, 4.452382 * 7.70757 * 7.278858), 0.0244, 0.0332, "",
     ),
-    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
+    ("structures/H2O_ice_Ih.cif", "tip4p2005", None, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built from"),
     # All its hydrogens are there (an ordered model of 1933), 0.82 Å from their oxygens.
-    ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built by"),
+    ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built from"),
     ("structures/H2O_ice_Ih.cif", "spce", inf, "is not spce: an atom is 0.173 Å from the rigid template"),
     ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
     ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 are no elements"),
@@ -598,7 +598,7 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
             "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
     again = build(Scene.from_dict(data, tmp_path))
     assert not any("box of the scene is used" in note for note in again.notes)
-    assert any("the scene's box: its lattice is described by" in note and "c' = c - a" in note for note in again.notes)
+    assert any("the scene's box: its lattice is given by" in note and "c' = c - a" in note for note in again.notes)
 
 
 def test_a_pdb_that_is_cut_off_says_so(tmp_path):
@@ -787,7 +787,7 @@ def test_velocities_of_some_atoms(tmp_path):
         "structure": {"file": "b.gro", "velocities": True},
         "forces": {"cutoff_A": 5.0},
     }
-    with pytest.raises(StructureError, match=r"no velocities for all atoms; 1 of its .*the first is atom 6"):
+    with pytest.raises(StructureError, match=r"no velocities of all atoms; 1 of its .*the first is atom 6"):
         build(Scene.from_dict(data, tmp_path))
 
 
@@ -821,7 +821,7 @@ def test_one_of_several_frames(ending, tmp_path):
         same_molecules(found, truth, [SPECIES["spce"]], 0.02)
         assert np.diag(found.cell) == pytest.approx(np.diag(truth.cell), abs=2e-3)
     with pytest.raises(
-        StructureError, match=r"holds 3 structures.*say which by structure.frame .1 to 3, -1 for the last"
+        StructureError, match=r"holds 3 structures.*select one by structure.frame .1 to 3, -1 for the last"
     ):
         read(tmp_path, text, f"a.{ending}")
     with pytest.raises(StructureError, match=r"structure.frame is 4: it holds 3, 1 is the first and -1 the last"):
@@ -970,7 +970,7 @@ def test_lammps_atom_types_without_masses_and_with_massless_sites(tmp_path):
     numbers = {"O": 1, "H": 2, "X": 3, "Ar": 4}
     for i, (_, element, *_) in enumerate(truth.atoms(), 1):
         text = re.sub(rf"^({i} \d+) \d+ 0.0 ", rf"\1 {numbers[element]} 0.0 ", text, flags=re.MULTILINE)
-    with pytest.raises(StructureError, match=r"no section Masses.*name them by structure.atom_types"):
+    with pytest.raises(StructureError, match=r"no section Masses.*name its atom types by structure.atom_types"):
         read(tmp_path, text, "a.data", ["tip4p2005", "argon"])
     for massless in ("MW", "X"):
         atom_types = {"1": "O", "2": "H", "3": massless, "4": "Ar"}
@@ -1235,7 +1235,7 @@ def test_lammps_data_as_people_write_it(case, name, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (data_of(WATER_DATA, "sphere", header="Atoms\n\n"), r"line 16: what the 7 columns .* 'Atoms # molecular'"),
+        (data_of(WATER_DATA, "sphere", header="Atoms\n\n"), r"line 16: the meaning of the 7 columns .* 'Atoms # molecular'"),
         (data_of(WATER_DATA, "molecular", header="Atoms # full\n\n"), r"line 16: an atom of style 'full' has 7 columns .*, found 6"),
         (data_of(WATER_DATA).replace("24 atoms\n", ""), "has no line with the number of atoms"),
         (data_of(WATER_DATA).replace("24 atoms\n", "23 atoms\n"), "line 3 promises 23 atoms, the section Atoms has 24"),
