@@ -134,7 +134,7 @@ def test_an_unknown_integrator_of_the_command(capsys, tmp_path):
     (tmp_path / "good.toml").write_text(GOOD)
     assert main(["accuracy", str(tmp_path / "good.toml"), "--integrators", "velocity_verlet,SRKN6"]) == 2
     message = capsys.readouterr().err
-    assert "--integrators: there is no SRKN6; did you mean srkn_6? (known: velocity_verlet" in message
+    assert "--integrators: unknown integrator SRKN6; did you mean srkn_6? (known: velocity_verlet" in message
 
 
 def test_the_command_and_the_scene_suggest_the_same_model(capsys, tmp_path):

@@ -49,7 +49,9 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
         raise SceneError(scene.source, ["a single body stays with rigidmd: export is for molecules"])
     _check(folder, force)
     writer = writer_for(to)
-    system = build(scene.model_copy(update={"engine": _engine_choice(to)}))
+    # GROMACS has the thermostats and barostats of rigidmd, so its scene has the defaults of rigidmd
+    engine = EngineChoice() if to == "gromacs" else EngineChoice.model_validate({"name": to})
+    system = build(scene.model_copy(update={"engine": engine}))
     view = force_field_of(system)
     unsupported = writer.unsupported_features(view) + [
         f"stages.{k}: a minimisation after other stages stays with rigidmd"
@@ -77,11 +79,6 @@ def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
     scene = system.scene.model_copy(update={"engine": EngineChoice()})
     return MolecularSimulation(scene, warn=lambda sentence: None).settle()
-
-
-def _engine_choice(to: str) -> EngineChoice:
-    """The engine whose defaults a scene gets; GROMACS has the thermostats and barostats of rigidmd."""
-    return EngineChoice() if to == "gromacs" else EngineChoice.model_validate({"name": to})
 
 
 def writer_for(to: str) -> EngineWriter:

@@ -46,7 +46,9 @@ def measure_accuracy(
     known = (*SCHEMES, *COMPARATORS)
     integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
-        errors = [f"there is no {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown]
+        errors = [
+            f"unknown integrator {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown
+        ]
         raise SceneError("--integrators", errors)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:

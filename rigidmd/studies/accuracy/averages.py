@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
 from rigidmd.core.state import State
-from rigidmd.core.statistics import mean
+from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run.molecular import MolecularSimulation
@@ -74,7 +74,8 @@ def measure_averages(
         elif found is None:
             steps = [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
         else:
-            steps = [_two_digits(ratio * stable_angle(scheme) / found.rate / FEMTOSECOND) for ratio in LADDER]
+            exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
+            steps = [round(step, 1 - floor(log10(step))) for step in exact]  # two digits, for tables and legends
         for step in sorted(set(steps)):
             cost = scheme.force_evaluations / (step * FEMTOSECOND)
             plan.append((_with_method(stage, integrator, thermostat, step, sample), AverageRun(
@@ -146,7 +147,7 @@ def _parse_method(text: str, stage: Stage) -> tuple[str, str]:
     integrator, _, thermostat = (part.strip() for part in text.partition("+"))
     known = (*SCHEMES, *WITH_THERMOSTAT)
     if integrator not in known:
-        error = f"there is no {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"
+        error = f"unknown integrator {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"
         raise SceneError("--integrators", [error])
     thermostat = thermostat or ("langevin" if integrator in WITH_THERMOSTAT else stage.thermostat_kind)
     if thermostat not in THERMOSTATS:
@@ -197,13 +198,8 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
         "density": results["density"],
     }
     for name, values in series.items():
-        average, error = mean(values[late])
+        average, error = mean_and_error(values[late])
         if average is not None and error is not None:
             run.averages[name] = average, error
         elif average is not None:
             run.short.append(name)
-
-
-def _two_digits(step: float) -> float:
-    """A step that a table and a legend can show."""
-    return round(step, 1 - floor(log10(step)))

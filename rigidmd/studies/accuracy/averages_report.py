@@ -4,7 +4,7 @@ from itertools import groupby
 from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, bare_axis, curve_style, drawing, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, drawing, open_axis, write_figure
 from rigidmd.io.write import columns_text, write_csv, write_json
 from rigidmd.studies.accuracy.bias import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
 from rigidmd.view.page import chips, code, items, page, plain, section, table, wide
@@ -24,7 +24,6 @@ def describe_scale(quantity: AveragedQuantity) -> str:
 
 
 def csv_headers(found: Averages) -> list[str]:
-    """Column titles of the table, units included."""
     titles = ["integrator", "thermostat", "step (fs)", "forces per ps", "seconds per ns"]
     for quantity in found.quantities:
         titles += [f"{quantity.name} ({quantity.unit})", "±", f"bias of {quantity.name} ({_bias_unit(quantity)})", "±"]
@@ -83,14 +82,6 @@ def describe_references(found: Averages) -> list[str]:
     return lines
 
 
-def _describe_step_at_limit(found: Averages, method: str, quantity: AveragedQuantity) -> str:
-    """The step at which the bias of a method is 1 %; empty where it is unknown."""
-    if (at := found.step_at_limit(method, quantity)) is None:
-        return ""
-    step, seen = at
-    return f"{step:.2g} fs" if seen else f"none seen, more than {step:.2g} fs"
-
-
 def methods_of(found: Averages) -> list[str]:
     return list(dict.fromkeys(run.method for run in found.runs))
 
@@ -98,8 +89,12 @@ def methods_of(found: Averages) -> list[str]:
 def _describe_limits(found: Averages) -> list[str]:
     lines = []
     for quantity in found.quantities:
-        steps = {method: _describe_step_at_limit(found, method, quantity) for method in methods_of(found)}
-        if steps := [f"{method} {step}" for method, step in steps.items() if step]:
+        known = {method: at for method in methods_of(found) if (at := found.step_at_limit(method, quantity))}
+        steps = [
+            f"{method} {step:.2g} fs" if seen else f"{method} none seen, more than {step:.2g} fs"
+            for method, (step, seen) in known.items()
+        ]
+        if steps:
             lines.append(
                 f"{quantity.name} is off by {BIAS_LIMIT:.0%} of {describe_scale(quantity)} at: {'; '.join(steps)}"
             )
@@ -203,7 +198,7 @@ def figure_of(found: Averages):
         axis.annotate(f"band: {BIAS_LIMIT:.0%} of {describe_scale(quantity)}", (0, 1), (0, 4), xycoords="axes fraction",
                       textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
-        bare_axis(axis)
+        open_axis(axis)
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
     for axis in axes[max(0, len(shown) - columns) : len(shown)]:

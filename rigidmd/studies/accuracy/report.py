@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, bare_axis, curve_style, drawing, few_decades, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, drawing, label_minor_ticks, open_axis, write_figure
 from rigidmd.io.write import columns_text, write_csv
 from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
 from rigidmd.view.page import chips, code, items, page, section, table, wide
@@ -306,9 +306,9 @@ def figure_of(found: IntegratorAccuracy):
         axis.loglog([t.time / s.span for t in front], [getattr(t, error) for t in front], "o", **ring)
         _label_steps(axis, [(t.time / s.span, getattr(t, error), t.timestep) for t in front])
         axis.set_title(title, loc="left", fontsize=9, color=INK)
-        bare_axis(axis, which="both")
-        few_decades(axis.xaxis)
-        few_decades(axis.yaxis)
+        open_axis(axis, which="both")
+        label_minor_ticks(axis.xaxis)
+        label_minor_ticks(axis.yaxis)
     figure.supxlabel(f"computing time (s) per {per} of motion", color=INK, fontsize=10)
     left.axhline(found.reference_error, color=FAINT, lw=0.8, ls=":")
     left.annotate("error of the reference", (1, found.reference_error), xycoords=("axes fraction", "data"), fontsize=8,

@@ -23,32 +23,24 @@ DOUBLINGS, RATIO = 10, 1.1
 
 
 class Outcome(NamedTuple):
-    """The outcome of one run.
+    """The outcome of one run."""
 
-    error : with respect to the known answer, in the unit of the case
-    reported_error : largest error of conserved quantities that the run itself reports, relative to kinetic energy, |L|
-    message : of the rigidmd error that refused or stopped it
-    """
-
-    error: float = nan
-    reported_error: float = nan
-    message: str = ""
+    error: float = nan  # with respect to the known answer, in the unit of the case
+    reported_error: float = nan  # largest error of conserved quantities that the run itself reports, relative
+    message: str = ""  # of the rigidmd error that refused or stopped it
     crash: str = ""
     seconds: float = 0.0
 
 
 @dataclass
 class CaseRun:
-    """One run with its expected outcome.
+    """One run with its expected outcome."""
 
-    setting : describes what was varied; x : the same as a number for the figure; allowed : largest error
-    """
-
-    setting: str
+    setting: str  # describes what was varied
     family: str
-    x: float
+    x: float  # the same as a number for the figure
     step: float
-    allowed: float
+    allowed: float  # largest error
     expected: tuple[str, ...]
     outcome: Outcome
 
@@ -126,11 +118,6 @@ class CaseResult:
         return [run for run in self.runs if run.verdict not in run.expected]
 
 
-def bounded(outcome: Outcome, bound: float = BOUND) -> bool:
-    """Whether a run reached its end with all errors of conserved quantities within this bound."""
-    return not outcome.message and not outcome.crash and outcome.reported_error <= bound
-
-
 def failure(outcome: Outcome) -> str:
     """How an unbounded run fails."""
     if outcome.crash:
@@ -153,8 +140,8 @@ def longest_step(
     seen: dict[float, Outcome] = {}
 
     def is_bounded(step: float) -> bool:
-        seen[step] = run(step)
-        return bounded(seen[step], bound)
+        seen[step] = outcome = run(step)
+        return not outcome.message and not outcome.crash and outcome.reported_error <= bound
 
     good, bad = (start, inf) if is_bounded(start) else (0.0, start)
     for _ in range(DOUBLINGS):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import write_text
-from rigidmd.figures.style import INK, bare_axis, curve_style, drawing, few_decades
+from rigidmd.figures.style import INK, curve_style, drawing, label_minor_ticks, open_axis
 from rigidmd.io.write import columns_text, write_csv
 from rigidmd.studies.stability.outcomes import (
     BOUND,
@@ -19,7 +19,6 @@ from rigidmd.studies.stability.outcomes import (
     UNDETECTED,
     VERDICTS,
     CaseResult,
-    CaseRun,
     StepLimit,
 )
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide
@@ -38,7 +37,8 @@ def _row(result: CaseResult, family: str) -> list[str]:
     limits = [limit for limit in result.limits if limit.family == family]
     verdicts = Counter(t.verdict for t in runs)
     # the worst of the finished runs, relative to the allowed error
-    worst = max((t for t in runs if isfinite(t.outcome.error)), key=_fraction_of_allowed, default=None)
+    relative = lambda t: t.outcome.error / t.allowed if t.allowed > 0 else t.outcome.error and inf  # noqa: E731
+    worst = max((t for t in runs if isfinite(t.outcome.error)), key=relative, default=None)
     # the least of its limits if there are several settings
     least = min(limits, key=lambda limit: limit.longest, default=None)
     seconds = sum(t.outcome.seconds for t in runs) + sum(limit.seconds for limit in limits)
@@ -48,10 +48,6 @@ def _row(result: CaseResult, family: str) -> list[str]:
         _describe_limit(least, result.step_unit) if least else "-", (least.beyond or "-") if least else "-",
         f"{seconds:.1f}",
     ]  # fmt: skip
-
-
-def _fraction_of_allowed(run: CaseRun) -> float:
-    return run.outcome.error / run.allowed if run.allowed > 0 else run.outcome.error and inf
 
 
 def _describe_limit(limit: StepLimit, unit: str) -> str:
@@ -109,9 +105,8 @@ def _csv_lines(result: CaseResult) -> list[list]:
         for t in result.runs
     ]  # fmt: skip
     lines += [
-        [result.name, result.group, "longest step", limit.setting, limit.family, limit.longest, result.step_unit, "",
-         "", "", "", "", limit.beyond, limit.seconds, limit.message]
-        for limit in result.limits
+        [result.name, result.group, "longest step", limit.setting, limit.family, limit.longest, result.step_unit,
+         *[""] * 5, limit.beyond, limit.seconds, limit.message] for limit in result.limits
     ]  # fmt: skip
     return [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
 
@@ -147,11 +142,11 @@ def picture(result: CaseResult, styles: dict[str, dict] | None = None):
             (_draw_runs if kind == "runs" else _draw_limits)(axis, result, family, styles[family])
         axis.set_xscale("log" if _positive(axis) else "linear")
         axis.set_yscale("log")
-        bare_axis(axis, labelsize=7, which="both")
+        open_axis(axis, labelsize=7, which="both")
         for line in (axis.xaxis, axis.yaxis):
             line.label.set(size=8, color=INK)
             if line.get_scale() == "log":
-                few_decades(line)
+                label_minor_ticks(line)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(frameon=False, fontsize=6.5, loc="upper left", bbox_to_anchor=(1.0, 1.0), labelcolor=INK)
     return figure

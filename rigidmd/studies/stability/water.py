@@ -6,7 +6,7 @@ from math import hypot, sqrt
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.core.statistics import mean
+from rigidmd.core.statistics import mean_and_error
 from rigidmd.studies.stability.cases import (
     QUICK,
     SPLIT,
@@ -142,8 +142,8 @@ def equipartition(result: CaseResult, quick: bool) -> None:
             def run(data=data) -> Outcome:
                 results = simulate(data)
                 half = len(results["time"]) // 5
-                rotation, its_error = mean(results["temperature_rotation_unbiased"][half:])
-                translation, error = mean(results["temperature_translation_unbiased"][half:])
+                rotation, its_error = mean_and_error(results["temperature_rotation_unbiased"][half:])
+                translation, error = mean_and_error(results["temperature_translation_unbiased"][half:])
                 if rotation is None or its_error is None or translation is None or error is None:
                     raise ValueError("these molecules have no temperature of one of their motions")
                 gap = abs(rotation - translation) / hypot(its_error, error)
@@ -169,7 +169,7 @@ def thermostat(result: CaseResult, quick: bool) -> None:
                 return heat_added / (10 * sqrt(4 * ratio * steps / FREEDOM))
             if ratio < 1:
                 return 0.0 if np.isfinite(kinetic).all() else np.inf
-            mean = kinetic[1:].mean() / (0.5 * FREEDOM * 298.0 * 0.008314462618)
-            return abs(mean - 1) / sqrt(2 / FREEDOM / steps)
+            ratio = kinetic[1:].mean() / (0.5 * FREEDOM * 298.0 * 0.008314462618)
+            return abs(ratio - 1) / sqrt(2 / FREEDOM / steps)
 
         result.add(f"dt/tau = {ratio:.0e}", run_molecules(data, state, error), 1.0 if weak else 5.0, SPLIT, ratio, step)

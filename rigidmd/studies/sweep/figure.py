@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.figures.style import FAINT, INK, bare_axis, curve_style, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, write_figure
 from rigidmd.studies.sweep.folder import FIGURE, SEED, describe_values, short_keys, value_name
 from rigidmd.studies.sweep.table import DRIFT, MAIN, MAIN_OF_BODY, SweepRow, Table
 
@@ -180,7 +180,7 @@ def _draw(panel_axes, axis: HorizontalAxis, panel: SweepPanel) -> None:
         panel_axes.set_yscale("log")
     elif not _is_tiny(panel):
         panel_axes.ticklabel_format(axis="y", useOffset=False)
-    bare_axis(panel_axes, labelsize=8)
+    open_axis(panel_axes, labelsize=8)
 
 
 def _spans_decades(panel: SweepPanel) -> bool:

@@ -36,46 +36,31 @@ class ManifestVersion(BaseModel):
 
 @dataclass
 class SweepPoint:
-    """A point of a sweep.
-
-    folder : name of its folder
-    values : swept key -> value
-    scene_sha256 : digest of its scene, as it was read, and of the files that it reads
-    ran_sha256 : scene_sha256 of the summary of its run, once it has ended
-    message : why a point failed
-    seconds : run time of all attempts
-    """
+    """A point of a sweep."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
 
-    folder: str
-    values: dict[str, Any]
-    scene_sha256: str
+    folder: str  # its name
+    values: dict[str, Any]  # swept key -> value
+    scene_sha256: str  # digest of its scene, as it was read, and of the files that it reads
     state: Annotated[str, Field(pattern="^(waiting|running|finished|interrupted|failed)$")] = WAITING
-    ran_sha256: str | None = None
-    message: str | None = None
-    seconds: Bounded = 0.0
+    ran_sha256: str | None = None  # scene_sha256 of the summary of its run, once it has ended
+    message: str | None = None  # why it failed
+    seconds: Bounded = 0.0  # run time of all attempts
 
 
 @dataclass
 class Manifest:
-    """The scene, the keys and the points of a sweep.
-
-    scene : the file of the scene
-    keys : swept key -> the keys that are set together with it, itself first
-    fixed : key -> value for all points
-    common : dotted key -> value of the scene, without the swept keys
-    inputs : dotted key -> SHA-256 of the files that all points read
-    """
+    """The scene, the keys and the points of a sweep."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
 
     name: str
-    scene: str
-    keys: dict[str, list[str]]
-    fixed: dict[str, Any]
-    common: dict[str, Any]
-    inputs: dict[str, str]
+    scene: str  # its file
+    keys: dict[str, list[str]]  # swept key -> the keys that are set together with it, itself first
+    fixed: dict[str, Any]  # key -> value for all points
+    common: dict[str, Any]  # dotted key -> value of the scene, without the swept keys
+    inputs: dict[str, str]  # dotted key -> SHA-256 of the files that all points read
     points: list[SweepPoint] = field(default_factory=list)
     schema: int = SCHEMA
 

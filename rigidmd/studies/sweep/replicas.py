@@ -145,10 +145,10 @@ def _mean_value(values: list[Value], runs: int) -> Value:
         only = next((value for value in values if value.value is not None), values[0])
         return only._replace(note=f"of one of {runs} runs") if there else only
     note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
-    return Value(values[0].name, values[0].unit, *mean_and_error(np.array(there)), None, note)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return Value(values[0].name, values[0].unit, *mean_over_replicas(np.array(there)), None, note)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def mean_and_error(values: np.ndarray) -> tuple[Any, Any]:
+def mean_over_replicas(values: np.ndarray) -> tuple[Any, Any]:
     """Means over replicas (n, ...), and their standard errors."""
     return values.mean(axis=0), standard_error(values)
 
@@ -177,7 +177,7 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
     columns, errors = {}, {}
     for title in first.columns:
         if all(title in one for one in sampled):
-            columns[title], errors[title] = mean_and_error(np.array([one[title] for one in sampled]))
+            columns[title], errors[title] = mean_over_replicas(np.array([one[title] for one in sampled]))
     return Curve(first.file, (header, kept), first.label, columns, errors, first.log, first.level, first.bars)
 
 

@@ -1,5 +1,6 @@
 """`rigidmd sweep`: points are checked, the folder is opened, points run, table and figure are written."""
 
+import csv
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
+from rigidmd.io.write import write_csv
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.axes import Axis, axes_of, check_axes
@@ -18,6 +20,7 @@ from rigidmd.studies.sweep.figure import draw_sweep
 from rigidmd.studies.sweep.folder import (
     FINISHED,
     SEED,
+    TABLE,
     Manifest,
     check_sweep_folder,
     is_sweep,
@@ -28,32 +31,24 @@ from rigidmd.studies.sweep.folder import (
 from rigidmd.studies.sweep.plan import merge_manifests, order_axes, read_points, update_state
 from rigidmd.studies.sweep.processes import Pool
 from rigidmd.studies.sweep.running import Runner, run_points, task_of
-from rigidmd.studies.sweep.table import Table, table_of, write_table
+from rigidmd.studies.sweep.table import Table, table_of
 from rigidmd.studies.sweep.worker import PointResult, Send, run_task
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class SweepRequest(NamedTuple):
-    """What the user asks for.
+    """What the user asks for."""
 
-    path : the scene file
-    axes : keys and their values, see `parse_axis`
-    folder : default: runs/NAME-sweep
-    replicas : number of seeds, from the seed of the scene on
-    trust : Python files that the scene may run
-    force : remove the sweep in the folder
-    """
-
-    path: Path
+    path: Path  # of the scene file
     axes: list[Axis]
-    folder: Path | None = None
-    replicas: int | None = None
-    trust: Sequence[str] = ()
-    force: bool = False
+    folder: Path | None = None  # default: runs/NAME-sweep
+    replicas: int | None = None  # number of seeds, from the seed of the scene on
+    trust: Sequence[str] = ()  # Python files that the scene may run
+    force: bool = False  # remove the sweep in the folder
 
 
 class OpenSweep(NamedTuple):
@@ -176,7 +171,8 @@ def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     table = table_of(folder, manifest)
     if not any(row.runs for row in table.rows):
         return table, []
-    files = [write_table(table), draw_sweep(table, manifest.name)]
+    write_csv(folder / TABLE, table.lines(), csv.QUOTE_NONNUMERIC)
+    files = [folder / TABLE, draw_sweep(table, manifest.name)]
     return table, [path for path in files if path is not None and path.is_file()]
 
 

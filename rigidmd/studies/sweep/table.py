@@ -1,7 +1,5 @@
 """The table of a sweep: a line for each combination of values, with means and errors over its replicas."""
 
-import csv
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -10,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.analysis.source import production_samples
-from rigidmd.core.statistics import format_with_error, mean, standard_error
+from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
 from rigidmd.errors import RigidMDError
-from rigidmd.io.write import columns_text, nine_digits, write_csv
+from rigidmd.io.write import columns_text, nine_digits
 from rigidmd.run.record import Record, read_record
-from rigidmd.studies.sweep.folder import FINISHED, TABLE, Manifest, short_keys, value_name
+from rigidmd.studies.sweep.folder import FINISHED, Manifest, short_keys, value_name
 
 if TYPE_CHECKING:
     import pandas
@@ -41,12 +39,10 @@ Measured = tuple[float, float | None]
 
 @dataclass
 class SweepRow:
-    """A combination of values of all keys but the seed, and the results of its runs.
-
-    runs : value of the seed, None if it is not swept -> column -> value and error of that run
-    """
+    """A combination of values of all keys but the seed, and the results of its runs."""
 
     values: dict[str, Any]
+    #: Value of the seed, None if it is not swept -> column -> value and error of that run.
     runs: dict[Any, dict[str, Measured]] = field(default_factory=dict)
 
     def __getitem__(self, column: str) -> Measured:
@@ -149,16 +145,14 @@ def summarise_run(record: Record) -> dict[str, Measured]:
 
     Raises OutputError.
     """
-    return _of_body(record) if record.is_body else _of_molecules(record)
-
-
-def _of_molecules(record: Record) -> dict[str, Measured]:
+    if record.is_body:
+        return _summarise_motion(record)
     _, production = production_samples(record)
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
         if name in LEFT_OUT:
             continue
-        average, error = mean(values[production])
+        average, error = mean_and_error(values[production])
         if average is None:
             continue
         if np.ptp(values[production]) == 0:
@@ -173,7 +167,7 @@ def _of_molecules(record: Record) -> dict[str, Measured]:
     return found
 
 
-def _of_body(record: Record) -> dict[str, Measured]:
+def _summarise_motion(record: Record) -> dict[str, Measured]:
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
         is_rotation = name[:2] in ("q1", "q2", "q3", "qw", "qx", "qy", "qz")
@@ -188,12 +182,6 @@ def _of_body(record: Record) -> dict[str, Measured]:
     return found
 
 
-def write_table(table: Table) -> Path:
-    """Write sweep.csv. Raises OutputError."""
-    write_csv(table.folder / TABLE, table.lines(), csv.QUOTE_NONNUMERIC)
-    return table.folder / TABLE
-
-
 def table_text(table: Table) -> str:
     """The main columns as text."""
     short = short_keys(table.keys)
@@ -201,10 +189,7 @@ def table_text(table: Table) -> str:
     lines = [[*short.values(), "runs", *(SHORT.get(column, column) for column in shown)]]
     for row in table.rows:
         cells = [value_name(row.values[key]) for key in table.keys] + [str(len(row.runs))]
-        lines.append([*cells, *(_format_cell(row, column) for column in shown)])
+        means = [row[column] for column in shown]
+        cells += ["-" if not np.isfinite(value) else format_with_error(value, error) for value, error in means]
+        lines.append(cells)
     return columns_text(lines, left=())
-
-
-def _format_cell(row: Mapping[str, Measured] | SweepRow, column: str) -> str:
-    value, error = row[column]
-    return "-" if not np.isfinite(value) else format_with_error(value, error)

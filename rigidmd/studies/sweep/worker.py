@@ -29,28 +29,24 @@ Send = Callable[[str, Any], None]
 
 
 class PointTask(TypedDict):
-    """One point, as JSON.
+    """One point, as JSON."""
 
-    folder : of the sweep; name : of the point's folder in it; sha256 : digest of its scene
-    ends_at : `time.time()` at which it has to have ended; None for never
-    """
-
-    folder: str
-    name: str
+    folder: str  # of the sweep
+    name: str  # of the point's folder in it
     scene: str
     overrides: dict[str, Any]
     trust: list[str]
-    sha256: str
+    sha256: str  # digest of its scene
     ran_sha256: str | None
-    ends_at: float | None
+    ends_at: float | None  # `time.time()` at which it has to have ended; None for never
 
 
 class PointResult(TypedDict):
-    """How a point ended. sha256 : scene_sha256 of its summary."""
+    """How a point ended."""
 
     state: str
     message: str | None
-    sha256: str | None
+    sha256: str | None  # scene_sha256 of its summary
     seconds: float
     out_of_time: bool
 
