@@ -17,8 +17,8 @@ from MDAnalysis.analysis.rdf import InterRDF
 from support import (
     ROOT,
     build,
-    gmx,
     frames_of_folder,
+    gmx,
     read_record,
     registry,
     small_scene,

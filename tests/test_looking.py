@@ -366,7 +366,7 @@ def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     assert len(numbers(data_of(page)["time"], "<f8")) == 3
-    assert "3 of 5 frames are in this film, every 2th" in page.read_text("utf-8")
+    assert "3 of 5 frames are shown, every 2th" in page.read_text("utf-8")
 
 
 def test_a_page_is_not_replaced_unless_asked(top, tmp_path, capsys):
@@ -569,5 +569,5 @@ def test_a_gallery_leads_to_films(tmp_path, capsys):
     assert cli.main(["gallery", "heavy_top_3", "-o", str(folder)]) == 2
     assert "--force replaces it" in capsys.readouterr().err
     assert cli.main(["gallery", "water", "-o", str(tmp_path / "other")]) == 2
-    assert "there is no shipped body 'water'" in capsys.readouterr().err
+    assert "unknown body 'water'" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()

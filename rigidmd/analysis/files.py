@@ -15,7 +15,7 @@ from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.source import frames_of_folder
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import COLORS, FAINT, INK, bare_axis, few_decades, thin_series, write_figure
+from rigidmd.figures.style import COLORS, FAINT, INK, label_minor_ticks, open_axis, thin_series, write_figure
 from rigidmd.io.folder import add_to_folder, written_by_runs
 from rigidmd.io.run_files import Bounded, read_columns, read_json
 from rigidmd.io.write import nine_digits, write_csv, write_json
@@ -198,10 +198,10 @@ def draw_curve(curve: Curve):
     for line, is_log, name in ((axis.xaxis, curve.log[0], "x"), (axis.yaxis, curve.log[1], "y")):
         if is_log:
             getattr(axis, f"set_{name}scale")("log")
-            few_decades(line)
+            label_minor_ticks(line)
     axis.set_xlabel(header.replace("(A)", "(Å)").replace("1/A", "1/Å"), fontsize=9, color=INK)
     axis.set_ylabel(curve.label, fontsize=9, color=INK)
-    bare_axis(axis, labelsize=8)
+    open_axis(axis, labelsize=8)
     if len(shown) > 1 and not curve.bars:
         figure.legend(
             *axis.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=7,

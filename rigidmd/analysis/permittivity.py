@@ -5,7 +5,7 @@ import numpy as np
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import AnalysisResult, Curve, converged_value
 from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.core.statistics import correlation_time, mean
+from rigidmd.core.statistics import correlation_time, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.units import COULOMB, DEBYE
 
@@ -51,7 +51,7 @@ def dielectric(frames: RigidFrames) -> AnalysisResult:
     gap = frames.span / (len(frames) - 1)
     off = dipole - dipole.mean(axis=0)
     squares = np.einsum("fi,fi->f", off, off)
-    size, error = mean(squares)
+    size, error = mean_and_error(squares)
     correlation = float(np.mean([correlation_time(dipole[:, k], gap) for k in range(3)]))
     volume = float(frames.volume.mean())
     y = 4 * np.pi * COULOMB * squares.mean() / (3 * volume * frames.thermal_energy)  # <M²>/(3 eps0 V kT)

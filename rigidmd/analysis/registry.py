@@ -10,7 +10,7 @@ import numpy as np
 from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.core.files import unreadable_reason
-from rigidmd.core.statistics import correlation_time, mean
+from rigidmd.core.statistics import correlation_time, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.scene.validation import did_you_mean
 
@@ -122,7 +122,7 @@ def _analyse_by_function(
                 f"the analysis {name}: {title!r} is not a finite number at frame {np.isfinite(array).argmin() + 1}"
             )
         columns[str(title)] = array
-        value, error = mean(array)
+        value, error = mean_and_error(array)
         gap = frames.span / (len(frames) - 1)
         if np.ptp(array) == 0 or value is None:
             values.append(Value(str(title), "", float(array[0]), 0.0))

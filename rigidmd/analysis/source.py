@@ -39,11 +39,7 @@ def frames_of_folder(
         )
     system = record.molecules
     output = system.scene.output
-    if not output.trajectory:
-        raise OutputError(f"{record.folder}: this run wrote no trajectory (output.trajectory = false) to analyse")
-    path = record.folder / output.trajectory
-    if not path.is_file():
-        raise OutputError(f"{record.folder}: its trajectory {output.trajectory} is missing")
+    path = record.trajectory
     sites = system.site_count
     most = max(2, MOST_NUMBERS // (3 * sites + 18 * len(system.model.species)))
     frames = read_frames(path, sites, most)

@@ -8,7 +8,7 @@ from rigidmd.analysis.pair_histogram import count_pairs, heights
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, with_block_error
 from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.core.statistics import correlation_time, error_of_mean, mean
+from rigidmd.core.statistics import correlation_time, error_of_mean, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
@@ -157,7 +157,7 @@ def _peaks(
     tau = correlation_time(inside, gap) if len(frames) > 2 else None
     if len(usable) > 1:
         position, height, neighbours = error_of_mean(usable)
-        errors = [position, height, max(neighbours, mean(inside)[1] or 0.0)]
+        errors = [position, height, max(neighbours, mean_and_error(inside)[1] or 0.0)]
     titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
@@ -287,7 +287,7 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
     number = len(frames.system.model.species)
     bonds = np.array([_bonds(thinned, k, distance, angle, near_pairs) for k in range(len(thinned))])  # (f, n)
     each = bonds.mean(axis=1)
-    value, error = mean(each)
+    value, error = mean_and_error(each)
     most = int(bonds.max()) + 1
     fraction = np.array([np.mean(bonds == k) for k in range(most)])
     curve = Curve(

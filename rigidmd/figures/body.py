@@ -17,7 +17,7 @@ DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 UP = np.array([0.0, 0.0, 1.0])
-#: Lines with more points than this are rasterised in the SVG; level at which an error of exactly 0 is drawn.
+#: Lines with more points are rasterised in the SVG; level at which an error of exactly 0 is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
@@ -26,26 +26,21 @@ def draw_motion(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
     written = []
     for stem, figure in figures.items():
         with settings({"svg.hashsalt": stem}):
-            for ending, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
-                written.append(folder / f"{stem}.{ending}")
+            for suffix, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
+                written.append(folder / f"{stem}.{suffix}")
                 with atomic_file(written[-1]) as temporary:
                     save_figure(figure, temporary, **options)
     return written
 
 
 def motion_figures(
-    name: str,
-    columns: dict[str, np.ndarray],
-    axis_body: np.ndarray,
-    inertia: np.ndarray | None,
-    invariants: list[str],
-    gravity: np.ndarray | None,
-    flies: bool,
-) -> dict[str, "Picture"]:
+    name: str, columns: dict[str, np.ndarray], axis_body: np.ndarray, inertia: np.ndarray | None, invariants: list[str],
+    gravity: np.ndarray | None, translates: bool,
+) -> dict[str, "Picture"]:  # fmt: skip
     """The figures of FIGURES that these columns allow, under a title with the name of the run.
 
-    inertia : of a body whose omega stays on the ellipsoids of energy and momentum; flies : of one that is pinned, the
-    path of the axis tells that of the centre of mass
+    inertia : of a body whose omega stays on the ellipsoids of energy and momentum, or None
+    translates : whether the body is not pinned: the path of its centre of mass is then a figure
     """
     down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
     figures = {}
@@ -59,7 +54,7 @@ def motion_figures(
                 figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
             else:
                 figures["omega"] = _omega_figure(columns)
-        if flies:
+        if translates:
             figures["path"] = _path_figure(columns, down)
         figures["invariants"] = _invariants_figure(columns, invariants)
     figures = {stem: figure for stem, figure in figures.items() if figure is not None}
@@ -69,7 +64,7 @@ def motion_figures(
 
 
 def _new_figure(title: str, width: float, height: float):
-    """An empty figure; `motion_figures` completes its title with the name of the run."""
+    """An empty figure, to whose title `motion_figures` adds the name of the run."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
     figure = Picture(figsize=(width, height), layout="constrained")
@@ -105,14 +100,14 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     disc.plot([-1, 1, np.nan, 0, 0], [0, 0, np.nan, -1, 1], color=FAINT, lw=0.4, alpha=0.6)
     _draw_path(disc, path, view, path @ view[2], half, centre, COOL)
     _triad(disc, view, "xy")
-    zoom = f", enlarged {_times(1.12 / near)}" if enlarged else ""
+    zoom = f", enlarged {_enlargement(1.12 / near)}" if enlarged else ""
     disc.set_title(f"from {word}{zoom}; dashed: its θ {_range(polar)}", **NOTE)
-    _tell_start(figure)
+    _label_start(figure)
     return figure
 
 
-def _tell_start(figure) -> None:
-    """A legend outside of all panels: the dot is the start."""
+def _label_start(figure) -> None:
+    """A legend outside of the panels: the dot is the start."""
     from matplotlib.lines import Line2D
 
     dot = Line2D([], [], color=WARM, marker="o", ms=5, ls="none", label="start")
@@ -120,25 +115,25 @@ def _tell_start(figure) -> None:
 
 
 def _angles_figure(columns: dict[str, np.ndarray]):
-    """The Euler angles against time: φ and ψ continuous over whole turns, θ with at least a minimum span."""
+    """The Euler angles against time: φ and ψ continuous over full rotations, θ with at least a minimum span."""
     time, theta = columns["time"], np.degrees(columns["theta"])
-    phi, psi = _apart(columns)
+    phi, psi = _continuous_angles(columns)
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _new_figure("Euler angles (3-1-3)", 8, 6.4)
-    turning = [np.ptp(angle) > 360 for angle in angles]
-    drawn = [angle / 360 if many else angle for angle, many in zip(angles, turning, strict=True)]
-    labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", turning, strict=True)]
+    beyond_turn = [np.ptp(angle) > 360 for angle in angles]
+    drawn = [angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)]
+    labels = [f"{name} ({'text' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
     cells = figure.add_gridspec(3, 1)
     panels = _draw_series(figure, cells, time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0
-        turns = f"from {first:.6g}° to {last:.6g}°: {(last - first) / 360:+.4g} turns"
-        panel.set_title(turns if np.ptp(angle) > 1e-5 else _range(angle), **NOTE)
+        text = f"from {first:.6g}° to {last:.6g}°: {(last - first) / 360:+.4g} turns"
+        panel.set_title(text if np.ptp(angle) > 1e-5 else _range(angle), **NOTE)
     speed = np.sqrt(sum(columns[f"omega_body_{i}"] ** 2 for i in "123")) if "omega_body_1" in columns else 0 * time
     note = ""
     if (speed[1:] * np.diff(time)).max() > np.pi:
-        note = "the body turns by more than 180° between samples: turns are not all counted"
+        note = "the body rotates by more than 180° between samples: not all rotations are counted"
     elif np.abs(np.diff(angles[0])).max() > 90:
         note = "φ and ψ jump where θ passes 0° or 180°: they are undefined there"
     if note:
@@ -146,8 +141,8 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     return figure
 
 
-def _apart(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """φ and ψ; at θ = 0 or 180°, where only their sum or difference is defined, φ is that of the next sample."""
+def _continuous_angles(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """φ and ψ; at θ = 0 or 180°, where only their sum or difference is defined, with φ of the next sample."""
     phi, psi, theta = (columns[key].copy() for key in ("phi", "psi", "theta"))
     for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
         psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
@@ -174,7 +169,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     near, middle = 0.75 * np.ptp(flat, axis=0).max(), (flat.max(0) + flat.min(0)) / 2
     boxes = [(half, np.zeros(2), f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s")]
     if 1e-6 * half.max() < near < 0.2 * half.max():
-        boxes.append((np.full(2, near), middle, f"the path, enlarged {_times(half.max() / near)}"))
+        boxes.append((np.full(2, near), middle, f"the path, enlarged {_enlargement(half.max() / near)}"))
     figure = _new_figure("ω in the body frame", 6.2 + 4 * len(boxes), 5)
     cells = figure.add_gridspec(3, len(boxes) + 1, width_ratios=[1.25, 1, 1][-len(boxes) - 1 :])
     for column, (half, centre, title) in enumerate(boxes):
@@ -185,12 +180,12 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
         axis.set_title(title, **NOTE)
     labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
     _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, labels, 1e-9 * fastest, 2 * fastest)
-    _tell_start(figure)
+    _label_start(figure)
     return figure
 
 
 def _omega_figure(columns: dict[str, np.ndarray]):
-    """ω in the body frame against time, if it does not stay on ellipsoids."""
+    """ω in the body frame against time, for a body with other motion than a free one."""
     omega = [columns[f"omega_body_{i}"] for i in "123"]
     fastest = max(np.abs(part).max() for part in omega)
     figure = _new_figure("ω in the body frame", 8, 6.4)
@@ -201,13 +196,13 @@ def _omega_figure(columns: dict[str, np.ndarray]):
 
 def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     """Coordinates of the centre of mass against time, its path in a vertical plane and from above."""
-    place = np.stack([columns[key] for key in "xyz"], axis=-1)
-    span = np.ptp(place, axis=0).max()
-    least = 1e-11 * span + 1e-13 * np.abs(place).max()
+    position = np.stack([columns[key] for key in "xyz"], axis=-1)
+    span = np.ptp(position, axis=0).max()
+    least = 1e-11 * span + 1e-13 * np.abs(position).max()
     if not span > least:
         return None
     up = UP if down is None else -down
-    level = place - place.mean(0)
+    level = position - position.mean(0)
     level -= np.outer(level @ up, up)
     along = np.linalg.eigh(level.T @ level - (level**2).sum() * np.outer(up, up))[1][:, -1]
     still = np.ptp(level @ along) < least
@@ -220,24 +215,24 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     figure = _new_figure("path of the centre of mass", 4.2 + 3.8 * len(planes), 4.6)
     cells = figure.add_gridspec(3, len(planes) + 1)
     labels, stack = ("x (m)", "y (m)", "z (m)"), cells[:, 0].subgridspec(3, 1)
-    _draw_series(figure, stack, columns["time"], place.T, labels, least, span)
+    _draw_series(figure, stack, columns["time"], position.T, labels, least, span)
     for column, (title, right, upward) in enumerate(planes, start=1):
-        _draw_plane(figure.add_subplot(cells[:, column]), title, place, right, upward, least)
-    _tell_start(figure)
+        _draw_plane(figure.add_subplot(cells[:, column]), title, position, right, upward, least)
+    _label_start(figure)
     return figure
 
 
-def _draw_plane(axis, title: str, place: np.ndarray, right: np.ndarray, up: np.ndarray, least: float) -> None:
+def _draw_plane(axis, title: str, position: np.ndarray, right: np.ndarray, up: np.ndarray, least: float) -> None:
     """The path in one plane, with equal scales if possible; otherwise the title states the distortion."""
-    flat = np.stack([place @ right, place @ up], axis=-1)
+    flat = np.stack([position @ right, position @ up], axis=-1)
     span, centre = np.ptp(flat, axis=0), (flat.max(0) + flat.min(0)) / 2
     half = 0.55 * span
     if min(span) < least or max(span) < 8 * min(span):
         half = np.full(2, max(half))
         axis.set_aspect("equal")
     else:
-        title += f"; drawn {_times(max(span) / min(span))} too {'wide' if span[1] > span[0] else 'tall'}"
-    shown, style = _plan(flat, half)
+        title += f"; drawn {_enlargement(max(span) / min(span))} too {'wide' if span[1] > span[0] else 'tall'}"
+    shown, style = _path_style(flat, half)
     axis.plot(*flat[shown].T, color=COOL, **style)
     axis.plot(*flat[0], "o", color=WARM, ms=5)
     for which, side in (("x", right), ("y", up)):
@@ -319,9 +314,9 @@ def _shade(axis, solids: list[tuple[np.ndarray, str]], view: np.ndarray, half: n
 
 
 def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, half, centre, color: str) -> None:
-    """Draw a path in space with a dot at its start, thinner if longer. Returns the limits of the picture."""
+    """Draw a path in space with a dot at its start; longer paths are thinner."""
     flat = points @ view[:2].T
-    shown, style = _plan(flat, half.max())
+    shown, style = _path_style(flat, half.max())
     _front_and_back(axis, points[shown], view, depth[shown], (0.95, 0.25), color=color, **style)
     axis.plot(*flat[0], "o", color=WARM, ms=5, alpha=1.0 if depth[0] >= 0 else 0.5, zorder=4)
     axis.axis(np.stack([centre - half, centre + half], axis=1).ravel())
@@ -344,22 +339,22 @@ def _triad(axis, view: np.ndarray, names, down: np.ndarray | None = None) -> Non
     vectors = [(vector, name, INK) for vector, name in zip(np.eye(3), names, strict=False)]
     for vector, name, color in vectors if down is None else [*vectors, (0.8 * down, "g", WARM)]:
         tip = 30 * (view[:2] @ vector)
-        place = {"xycoords": "axes fraction", "textcoords": "offset points", "color": color, "fontsize": 9}
+        style = {"xycoords": "axes fraction", "textcoords": "offset points", "color": color, "fontsize": 9}
         if np.linalg.norm(tip) > 2:
             arrow = {"arrowstyle": "<-", "color": color, "lw": 0.8}
-            axis.annotate("", (0.1, 0.1), xytext=tip, arrowprops=arrow, **place)
-            axis.annotate(name, (0.1, 0.1), xytext=1.35 * tip, ha="center", va="center", **place)
+            axis.annotate("", (0.1, 0.1), xytext=tip, arrowprops=arrow, **style)
+            axis.annotate(name, (0.1, 0.1), xytext=1.35 * tip, ha="center", va="center", **style)
 
 
-def _plan(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
-    """Points of a path to draw, about one a pixel, and the line style, thinner for longer paths."""
+def _path_style(flat: np.ndarray, half) -> tuple[np.ndarray, dict]:
+    """Points of a path to draw, about one per pixel, and the line style, thinner for longer paths."""
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(flat, axis=0) / half, axis=1).cumsum()])
     shown = np.flatnonzero(np.diff(np.floor(800 * way), prepend=-1.0) > 0)
     return shown, {"lw": max(0.25, 1.7 / (1 + way[-1] / 60)), "rasterized": len(shown) > MOST_POINTS}
 
 
 def _range(degrees: np.ndarray) -> str:
-    """A range of degrees in words, with enough digits to distinguish its ends."""
+    """A range of degrees as text, with enough digits to distinguish its ends."""
     low, high = degrees.min(), degrees.max()
     if high - low < 1e-5:
         return f"{round(low, 6) + 0.0:.8g}°, constant{f' to {high - low:.0e}°' if high > low else ''}"
@@ -367,6 +362,6 @@ def _range(degrees: np.ndarray) -> str:
     return f"from {low:.{digits}f}° to {high:.{digits}f}°"
 
 
-def _times(factor: float) -> str:
+def _enlargement(factor: float) -> str:
     """An enlargement to two digits."""
     return f"×{float(f'{factor:.2g}'):,g}"

@@ -1,4 +1,4 @@
-"""Figures of Matplotlib. A notebook shows them, whether or not pyplot is imported there."""
+"""Matplotlib figures that a notebook displays without pyplot. Apart from `style`, as Matplotlib is slow to import."""
 
 import io
 from collections.abc import Iterator
@@ -15,20 +15,18 @@ DPI = 80
 
 
 class Picture(Figure):
-    """A figure of Matplotlib, apart from pyplot, so that a notebook shows it once: as the value of its cell.
+    """A figure of Matplotlib that is not known to pyplot, so that a notebook shows it once, as the value of its cell.
 
-    Its texts are shown as they are written: a name of a user may hold dollar signs, between which Matplotlib reads a
-    formula. Numbers at ticks stay formulas, such as powers of ten.
+    Texts are not parsed as formulas, as names of users may contain dollar signs; numbers at ticks are.
     """
 
     def draw(self, renderer) -> None:
-        """Draw it."""
         for text in _texts(self):
             text.set_parse_math(False)
         super().draw(renderer)
 
     def png(self) -> tuple[bytes, dict[str, float]]:
-        """It as PNG, and the width and height at which it is shown."""
+        """The figure as PNG, and the width and height at which it is shown."""
         stream = io.BytesIO()
         save_figure(self, stream, format="png", dpi=2 * DPI)
         width, height = self.get_size_inches()
@@ -38,7 +36,7 @@ class Picture(Figure):
 
 
 def _texts(artist: Artist) -> Iterator[Text]:
-    """All texts in an artist but the numbers at ticks."""
+    """All texts in an artist except the numbers at ticks."""
     if isinstance(artist, Text):
         yield artist
     elif isinstance(artist, Axis):

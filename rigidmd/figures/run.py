@@ -1,4 +1,4 @@
-"""The figures of a run in memory: what energy.png and the figures of a body are drawn from."""
+"""The figures of a run: energy.png of molecules, and the figures of a single body."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def run_figures(
     system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any]
 ) -> "dict[str, Picture]":
-    """The figures of a run by the names of their files; those that there are samples for."""
+    """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
         return body_figures(system, samples) if isinstance(samples, Motion) else {}
     if isinstance(samples, Samples) and moving(system.scene.stages, samples["stage"]).sum() > 1:
@@ -32,7 +32,7 @@ def run_figures(
 
 
 def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
-    """Figures of the axis, angles, omega, path and errors; none of fewer than three samples."""
+    """Figures of the axis, angles, omega, path and errors; none for fewer than three samples."""
     if len(samples) <= 2:
         return {}
     columns = dict(samples.columns)
@@ -47,12 +47,12 @@ def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
         inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
         invariants=samples.invariants,
         gravity=None if gravity is None else np.array(gravity),
-        flies=system.translates,
+        translates=system.translates,
     )
 
 
 def _keeps_its_ellipsoids(system: BodySystem, samples: Motion) -> bool:
-    """Whether the inertia is constant, the frame does not turn, and |L| is conserved: no torque acts."""
+    """Whether the inertia is constant, the frame does not rotate, and |L| is conserved, as no torque acts."""
     steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
     return steady and "L_size" in samples.invariants
 
@@ -72,7 +72,7 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
     last = stage == stage[-1]
-    known = bool(np.isfinite(column["drift"][last]).any())  # another engine may tell no conserved energy
+    known = bool(np.isfinite(column["drift"][last]).any())  # an external engine may not report it
     figure = Picture(figsize=(8, 7), layout="constrained")
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
@@ -105,33 +105,33 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
 
 
 def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray, color: str, label: str) -> None:
-    """A curve, with the limits of the axis wide enough for the range of it that is shown."""
+    """Draw a curve, and widen the limits of the axis to its `shown_range`."""
     before = axis.get_ylim() if axis.lines else None
     axis.plot(*thin_series(time, values), color=color, lw=0.9, label=label)
     if (limits := shown_range(values, stage)) is not None:
         axis.set_ylim(min(limits[0], *(before or limits)), max(limits[1], *(before or limits)))
 
 
-def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, told: dict) -> None:
-    """The conserved energy since each stage began, kJ/mol per molecule; of the last one with the line of its drift."""
+def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, summary: dict) -> None:
+    """Draw the conserved energy since each stage began, kJ/mol per molecule, and the line of the last drift."""
     last = stage == stage[-1]
     for k in np.unique(stage):
-        own = stage == k
-        axis.plot(*thin_series(time[own], drift[own]), color=COOL if own[-1] else FAINT, lw=0.9)
+        of_stage = stage == k
+        axis.plot(*thin_series(time[of_stage], drift[of_stage]), color=COOL if of_stage[-1] else FAINT, lw=0.9)
     low, high = np.nanmin(drift[last]), np.nanmax(drift[last])
     if high > low:
         axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
-    gradient, error = told["drift_kJ_mol_ns_per_molecule"], told["drift_error_kJ_mol_ns_per_molecule"]
+    gradient, error = summary["drift_kJ_mol_ns_per_molecule"], summary["drift_error_kJ_mol_ns_per_molecule"]
     if last.sum() > 2 and gradient is not None:
         line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
         axis.plot(time[last], line, color=WARM, lw=1.4)
-        title = f"{told['name']}: drift {format_signed(gradient, error)} kJ/mol/ns per molecule"
+        title = f"{summary['name']}: drift {format_signed(gradient, error)} kJ/mol/ns per molecule"
         axis.set_title(title, loc="left", fontsize=9, color=WARM)
     axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
 
 
 def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:
-    """Names of stages above the curves where they begin, each in the first row that is free there."""
+    """Draw names of stages above the curves where they begin, each in the first free row."""
     left, right = axis.get_xlim()
     rows: list[float] = []  # where the last name of each row ends, as a fraction of the axis
     for start, label in zip(starts, labels, strict=True):

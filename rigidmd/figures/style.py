@@ -1,4 +1,4 @@
-"""Shared by all figures: writing, and styles for many curves."""
+"""Functions for all figures: writing, settings, styles of curves, thinning of long series, views of 3D objects."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from rigidmd.core.files import atomic_file
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.errors import RigidMDError, RigidMDWarning
 
-#: Points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
+#: Most points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
 AT_ONCE = 5000
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 COLORS = ("#2b6f9e", "#c8553d", "#4f8a5b", "#7a5ca3", "#b8862d", "#1f2430", "#3fa7a0", "#c2569a", "#8a8f99", "#7f9a1c")
@@ -32,7 +32,7 @@ def curve_style(k: int) -> dict:
 class InPieces:
     """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous one.
 
-    Matplotlib's own pieces, `agg.path.chunksize`, omit the last point of each, and thus two sides of the path.
+    The pieces of Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two sides of the path.
     """
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
@@ -46,7 +46,7 @@ class InPieces:
 
 @contextmanager
 def settings(changed: dict) -> Iterator[None]:
-    """Within it Matplotlib has other settings. It has one set of them for all threads."""
+    """Context with other settings of Matplotlib, which has one set of them for all threads."""
     from matplotlib import rc_context
 
     with PROCESS_LOCK, rc_context(changed):
@@ -55,8 +55,8 @@ def settings(changed: dict) -> Iterator[None]:
 
 @contextmanager
 def drawing(path: Path) -> Iterator[Path]:
-    """A file to draw into, which takes its place when it is complete. Results do not depend on pictures and pages: an
-    error becomes a warning. Raises OutputError if it cannot be written."""
+    """A temporary file to draw into, renamed when it is complete. An error of drawing becomes a warning, as results do
+    not depend on pictures. Raises OutputError if the file cannot be written."""
     try:
         with atomic_file(path) as temporary:
             yield temporary
@@ -89,8 +89,8 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
         save_figure(figure, temporary, dpi=150)
 
 
-def bare_axis(axis, **ticks) -> None:
-    """Draw an axis without a frame: two sides, and ticks with these settings, all in ink."""
+def open_axis(axis, **ticks) -> None:
+    """Draw an axis without its frame on top and right, with these settings of ticks, in ink."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.spines[:].set_color(INK)
     axis.tick_params(colors=INK, **ticks)
@@ -108,9 +108,9 @@ def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple
 
 
 def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | None:
-    """Lowest and highest value (n,) on the axis of a curve: the range of the second half of each stage, and as much
-    above and below. What is beyond, at the start of a stage, would flatten the rest. None without a range."""
-    late = np.concatenate([own[len(own) // 2 :] for own in (values[stage == k] for k in np.unique(stage))])
+    """Limits of the axis of a curve (n,): the range of the second halves of the stages, and as much above and below, as
+    the starts of stages would flatten the rest. None if the range is 0."""
+    late = np.concatenate([part[len(part) // 2 :] for part in (values[stage == k] for k in np.unique(stage))])
     late, values = late[np.isfinite(late)], values[np.isfinite(values)]
     if len(late) == 0 or not (span := float(np.ptp(late))) > 0:
         return None
@@ -119,7 +119,7 @@ def shown_range(values: np.ndarray, stage: np.ndarray) -> tuple[float, float] | 
 
 
 def thin_path(path: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most about so many points of a path (n, d), evenly along its length, with its ends."""
+    """Indices of at most about `most` points of a path (n, d), evenly along its length, with its ends."""
     if len(path) <= most:
         return np.arange(len(path))
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
@@ -130,7 +130,7 @@ def thin_path(path: np.ndarray, most: int) -> np.ndarray:
 
 
 def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """An orthographic view from the direction `eye`: rows to the right, upwards and towards the eye."""
+    """An orthographic view from the direction `eye`: rows are to the right, upwards and towards the eye."""
     toward, right = eye / np.linalg.norm(eye), np.cross(up, eye)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(toward, right), toward])
@@ -139,11 +139,11 @@ def camera(eye: np.ndarray, up: np.ndarray) -> np.ndarray:
 def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
     """The circle on the unit sphere at this polar angle (degrees) from a direction."""
     right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
-    turn, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
-    return np.sin(polar) * (np.cos(turn) * right + np.sin(turn) * up) + np.cos(polar) * toward
+    angle, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
+    return np.sin(polar) * (np.cos(angle) * right + np.sin(angle) * up) + np.cos(polar) * toward
 
 
-def few_decades(line) -> None:
+def label_minor_ticks(line) -> None:
     """Label a logarithmic axis (`axis.xaxis` or `.yaxis`) between powers of ten if it has fewer than two of them."""
     from matplotlib.ticker import LogFormatterSciNotation
 

@@ -76,6 +76,16 @@ class Record:
         )
 
     @property
+    def trajectory(self) -> Path:
+        """Path of the trajectory. Raises OutputError if there is none."""
+        name = self.scene.output.trajectory
+        if not name:
+            raise OutputError(f"{self.folder}: this run wrote no trajectory (output.trajectory = false)")
+        if not (self.folder / name).is_file():
+            raise OutputError(f"{self.folder}: its trajectory {name} is missing")
+        return self.folder / name
+
+    @property
     def time_unit(self) -> str:
         return "s" if self.is_body else "ps"
 

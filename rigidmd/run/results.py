@@ -144,7 +144,7 @@ class Results(Displayed):
         if len(self.state.rotation) == 0:
             raise ValueError("nothing rotates in this run: it has points only")
         if not self._frames:
-            raise ValueError("this run kept no frames (output.trajectory = false)")
+            raise ValueError("this run has no frames (output.trajectory = false)")
         if self.files:
             path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
             if path.suffix != ".gsd":

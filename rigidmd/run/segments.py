@@ -65,7 +65,7 @@ class RunPosition(NamedTuple):
     seconds: NonNegative = 0.0  # of computing in this segment
 
     def to_json(self) -> dict[str, Any]:
-        """For a checkpoint, where the segment is called stretch."""
+        """For a checkpoint, where the key of the segment is `stretch`."""
         return {"stretch" if name == "segment" else name: value for name, value in self._asdict().items()}
 
     @staticmethod

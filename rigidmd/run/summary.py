@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import REMOVED, State
-from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean, slope
+from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Sample, Samples
@@ -119,7 +119,7 @@ def summarise(
 
 def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
     """The text of the choice for a stage; where it was for an error of the energy, also the error that was reached."""
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean(samples["temperature"])[0] or 0.0) * system.freedom_in(k).total
+    thermal = BOLTZMANN / KJ_PER_MOL * (mean_and_error(samples["temperature"])[0] or 0.0) * system.freedom_in(k).total
     if text is None or ENERGY_ERROR not in text or len(samples) < 2 or thermal == 0:
         return text
     rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
@@ -206,18 +206,18 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         (moving, rotating), corrected = unbiased, " without the error of the step"
         both = zip(unbiased, (freedom.translation, freedom.rotation), strict=True)
         right = sum((values * count for values, count in both if count), np.zeros(len(whole))) / freedom.total
-        heat, error = mean(right - whole)
+        heat, error = mean_and_error(right - whole)
         if heat is not None and error is not None and abs(heat) > max(HEATING_LIMIT * level, STANDARD_ERRORS * error):
             parts = [f"{name} {v.mean():.4g}" for name, v in zip(("T_trans", "T_rot"), pair, strict=True) if v[0] > 0]
             shorter = stage.timestep_fs * sqrt(HEATING_LIMIT * level / 2 / abs(heat))
             found.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
                 f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
-                f"{format_with_error(float(right.mean()), mean(right)[1])} K; at the steps it is {level:.4g} K, "
+                f"{format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the steps it is {level:.4g} K, "
                 f"{', '.join(parts)}, which the thermostat controls. Try timestep_fs = {shorter:.1g}, or integrator = "
                 "'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
             )
-    gap, error = mean(moving - rotating)
+    gap, error = mean_and_error(moving - rotating)
     if gap is not None and error is not None and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error):
         found.append(
             f"stages.{k}: in its second half T_trans is {moving.mean():.4g} K and T_rot {rotating.mean():.4g} K"
@@ -245,7 +245,7 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
     line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
-    mean_t, error_t = mean(of_stage["temperature"])
+    mean_t, error_t = mean_and_error(of_stage["temperature"])
     spread = float(of_stage["kinetic"].std())
     per_molecule = line.value * 1000 / n
     thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom_in(k).total
@@ -263,13 +263,13 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
         "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "temperature_K": mean_t,
         "temperature_error_K": error_t,
-        "temperature_translation_K": mean(of_stage["temperature_translation"])[0],
-        "temperature_rotation_K": mean(of_stage["temperature_rotation"])[0],
-        "temperature_translation_unbiased_K": mean(of_stage["temperature_translation_unbiased"])[0],
-        "temperature_rotation_unbiased_K": mean(of_stage["temperature_rotation_unbiased"])[0],
+        "temperature_translation_K": mean_and_error(of_stage["temperature_translation"])[0],
+        "temperature_rotation_K": mean_and_error(of_stage["temperature_rotation"])[0],
+        "temperature_translation_unbiased_K": mean_and_error(of_stage["temperature_translation_unbiased"])[0],
+        "temperature_rotation_unbiased_K": mean_and_error(of_stage["temperature_rotation_unbiased"])[0],
         "potential_kJ_mol_per_molecule": float(np.mean(of_stage["potential"])) / n,
-        "pressure_bar": mean(of_stage["pressure_bar"])[0],
-        "pressure_error_bar": mean(of_stage["pressure_bar"])[1],
+        "pressure_bar": mean_and_error(of_stage["pressure_bar"])[0],
+        "pressure_error_bar": mean_and_error(of_stage["pressure_bar"])[1],
         **(_box_means(of_stage) if stage.has_barostat else {}),
         "moves_tried": moves[0],
         "moves_accepted": moves[1],
@@ -309,7 +309,7 @@ def _box_means(of_stage: Samples) -> dict:
     """Means of density and edges of the box, with their errors."""
     found = {}
     for name, key in (("density", "density{}_g_cm3"), ("a", "a{}_A"), ("b", "b{}_A"), ("c", "c{}_A")):
-        value, error = mean(of_stage[name])
+        value, error = mean_and_error(of_stage[name])
         found |= {key.format(""): value, key.format("_error"): error}
     return found
 

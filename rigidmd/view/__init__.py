@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
 
     from rigidmd.figures.picture import Picture
-    from rigidmd.view.inline import Film
+    from rigidmd.view.notebook_animation import AnimationPage
 
 __all__ = ["plot", "show"]
 
@@ -16,20 +16,21 @@ __all__ = ["plot", "show"]
 def plot(results: Results, *columns: str, log: bool = False) -> "Picture":
     """A Matplotlib figure of a run, which a notebook displays and `savefig` writes.
 
-    columns : names of columns, drawn against time, those of one unit in one panel; log: absolute values on a
-    logarithmic axis. Without names it is the main figure of the run: energy.png, of a body the path of its axis. The
-    name of another figure of a body ("angles", "ellipsoids", "path", "invariants") draws that one. Raises KeyError.
+    columns : names of columns, drawn against time, with one panel for each unit; default: the main figure of the run
+        (energy.png, or the path of the axis of a body); or the name of another figure of a body ("angles",
+        "ellipsoids", "path", "invariants")
+    log : absolute values on a logarithmic axis. Raises KeyError
     """
-    from rigidmd.view.columns import plot as draw
+    from rigidmd.view.plots import plot as draw
 
     return draw(results, columns, log)
 
 
-def show(results: Results) -> "StructureWidget | Film":
+def show(results: Results) -> "StructureWidget | AnimationPage":
     """The animation of a run in a notebook: molecules by chemiscope, a body on a small page.
 
     Raises ImportError without chemiscope (rigidmd[view]), ValueError without a trajectory.
     """
-    from rigidmd.view.inline import view
+    from rigidmd.view.notebook_animation import show_animation
 
-    return view(results)
+    return show_animation(results)

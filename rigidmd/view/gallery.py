@@ -1,4 +1,4 @@
-"""A page with a picture of each shipped body, which leads to its film: runs the scenes and writes their pages."""
+"""A page with a picture of each shipped body, linked to its animation: runs the scenes and writes their pages."""
 
 import base64
 import html
@@ -9,46 +9,45 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import write_text
-from rigidmd.errors import Faults
+from rigidmd.core.shipped import Example, examples
+from rigidmd.errors import InputError
 from rigidmd.figures.style import save_figure
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene import Scene
-from rigidmd.scene.shipped import Example, examples
-from rigidmd.view.body_film import body_film
-from rigidmd.view.draw_body import BodyPicture
-from rigidmd.view.film_page import write_view
+from rigidmd.view.animation_page import write_view
+from rigidmd.view.body_animation import BodyDrawing, animate_body
 from rigidmd.view.page import code, page
 
 INDEX = "index.html"
-#: The bodies that are run where none is named.
+#: The default bodies.
 SHOWN = (
     *(f"heavy_top_{k}" for k in range(1, 8)), "intermediate_axis", "sleeping_top", "gyrocompass", "dropped_stone",
 )  # fmt: skip
-#: Inches and dots per inch of a picture, and the share of the run that it shows: a body in the midst of its motion.
-INCHES, DPI, SHARE = 3.2, 100, 0.62
+#: Inches and dots per inch of a picture, and the fraction of the run that has passed in it.
+INCHES, DPI, RUN_FRACTION = 3.2, 100, 0.62
 STYLE = """<style>.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
 .cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;padding:.6rem;display:block}
 .cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}</style>"""
 
 
-def chosen(names: list[str]) -> list[Example]:
-    """The shipped bodies of these names; of none, those of SHOWN. Raises Faults."""
+def selected_bodies(names: list[str]) -> list[Example]:
+    """The shipped bodies with these names, or those of SHOWN. Raises RigidMDError."""
     bodies = {example.name: example for example in examples() if example.is_body}
-    if strange := [name for name in names if name not in bodies]:
-        raise Faults("gallery", [f"there is no shipped body {strange[0]!r}; there are {', '.join(bodies)}"])
+    if unknown := [name for name in names if name not in bodies]:
+        raise InputError("gallery", [f"unknown body {unknown[0]!r}; shipped are {', '.join(bodies)}"])
     return [bodies[name] for name in names or SHOWN]
 
 
 def write_gallery(
     folder: Path, names: list[str], force: bool, command: str, progress: Callable[[str], object] = lambda name: None
 ) -> Path:
-    """Run bodies into folder/runs, write their pages, and one that leads to them. Returns its path. Raises OutputError.
+    """Run bodies into folder/runs, write their pages and an index. Returns the path of the index. Raises OutputError.
 
     progress : called with the name of each body before it runs
     """
     cards = []
-    for example in chosen(names):
+    for example in selected_bodies(names):
         progress(example.name)
         scene = Scene.read(example.path, {"output.figures": False, "output.trajectory": False})
         run = folder / "runs" / example.name
@@ -59,7 +58,7 @@ def write_gallery(
             f"<b>{html.escape(example.name)}</b><span>{html.escape(example.about)}</span></a>"
         )
     parts = [
-        '<p class="faint">Each picture leads to the film of the body.</p>',
+        '<p class="faint">Each picture links to the animation of the body.</p>',
         f'<div class="cards">{"".join(cards)}</div>',
         code(command),
     ]
@@ -68,13 +67,13 @@ def write_gallery(
 
 
 def _picture(record: Record) -> str:
-    """A moment of the film, PNG in base64."""
+    """A picture from the animation, PNG in base64."""
     from rigidmd.figures.picture import Picture
 
-    film = body_film(record)
+    animation = animate_body(record)
     figure = Picture(figsize=(INCHES, INCHES), dpi=DPI)
-    time = float(np.interp(SHARE, [0, 1], film.time[[0, -1]]))
-    BodyPicture(film, not record.body.flies).draw(figure.add_axes((0, 0, 1, 1)), time)
+    time = float(np.interp(RUN_FRACTION, [0, 1], animation.time[[0, -1]]))
+    BodyDrawing(animation, not record.body.translates).draw(figure.add_axes((0, 0, 1, 1)), time)
     stream = io.BytesIO()
     save_figure(figure, stream, format="png", dpi=DPI)
     return base64.b64encode(stream.getvalue()).decode()

@@ -1,4 +1,4 @@
-"""The surface of a single body, to be drawn: its solid, its points joined, or a solid of the same inertia."""
+"""The surface of a single body for drawings: its solid, its points joined by rods, or a solid of the same inertia."""
 
 from functools import partial
 from itertools import pairwise, product
@@ -12,10 +12,10 @@ from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import SOLIDS
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
-#: Corners of a circle; a body that has no thickness gets this share of its reach.
-ROUND, THIN = 24, 0.02
-#: Edges of the cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its length.
-CUBOID, STEM = (12 / 5) ** 0.5, 0.06
+#: Corners of a circle; least thickness of a body, as a fraction of its reach.
+CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02
+#: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its length.
+CUBOID_EDGES, STEM_THICKNESS = (12 / 5) ** 0.5, 0.06
 EQUAL = "of the same mass and inertia"
 
 
@@ -24,8 +24,8 @@ class Mesh(NamedTuple):
 
     vertices: np.ndarray  # (v, 3)
     faces: list[list[int]]  # corners of each face, in order, seen from outside counterclockwise
-    painted: list[bool]  # which faces show how the body turns
-    about: str  # what it is, in words
+    painted: list[bool]  # which faces have a second colour, to show rotation
+    about: str  # description
     stem: bool = False  # whether it reaches to the pivot
 
     @property
@@ -41,34 +41,34 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(system: BodySystem) -> Mesh:
-    """The surface of a body: what the scene draws it as, its solid, its points joined, or a body of equal inertia."""
+    """The surface of a body: as the scene asks for, its solid, its points joined, or a body of equal inertia."""
     table, scene = system.scene.body, system.scene
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
     if wanted is None and table.points is not None:
-        places = np.array([p.position_m for p in table.points])
+        positions = np.array([p.position_m for p in table.points])
         masses = np.array([p.mass_kg for p in table.points])
-        return _of_points(places if table.pinned else places - masses @ places / mass, masses)
+        return _points_mesh(positions if table.pinned else positions - masses @ positions / mass, masses)
     if isinstance(wanted, Solid):
         stands = wanted.shape == "cone" and table.pinned
-        return _of_solid(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
+        return _solid_mesh(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
     if wanted is None and table.solid is not None:
-        return _of_solid(table.solid, centre)
-    return _of_equal_inertia(wanted, mass, inertia_at_centre(scene), centre, table.pinned)
+        return _solid_mesh(table.solid, centre)
+    return _equal_inertia_mesh(wanted, mass, inertia_at_centre(scene), centre, table.pinned)
 
 
-def _of_solid(solid: Solid, place: np.ndarray) -> Mesh:
-    """A solid of given dimensions about a place."""
-    stretch = np.zeros(3)
+def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
+    """A solid of given dimensions about a position."""
+    size = np.zeros(3)
     for name, axes in SOLIDS[solid.shape].dimensions.items():
-        stretch[axes] = solid.dimensions[name]
-    stretch = np.maximum(stretch, THIN * stretch.max())
+        size[axes] = solid.dimensions[name]
+    size = np.maximum(size, MIN_THICKNESS * size.max())
     unit = UNITS.get(solid.shape, _ball)()
     article = "an" if solid.shape[0] in "aeiou" else "a"
-    return Mesh(unit.vertices * stretch + place, unit.faces, unit.painted, f"{article} {solid.shape}")
+    return Mesh(unit.vertices * size + position, unit.faces, unit.painted, f"{article} {solid.shape}")
 
 
-def _of_equal_inertia(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
+def _equal_inertia_mesh(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
     """A homogeneous body of this mass and inertia about its centre: a solid of revolution if two moments are equal,
     else a cuboid, or what is wanted.
     """
@@ -78,15 +78,17 @@ def _of_equal_inertia(wanted: str | None, mass: float, tensor: np.ndarray, centr
     moments, axes = principal(tensor)
     symmetric = axis_of_symmetry(moments)
     if wanted in (None, "top") and symmetric is not None:
-        return _top(mass, moments, axes, symmetric, centre, pinned)
+        return _top_mesh(mass, moments, axes, symmetric, centre, pinned)
     lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
-    lengths, unit, shape = np.maximum(lengths, THIN * lengths.max()), _ball(), "ellipsoid"
+    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), _ball(), "ellipsoid"
     if wanted != "ellipsoid":
-        lengths, unit, shape = CUBOID * lengths, _cuboid(), "cuboid"
+        lengths, unit, shape = CUBOID_EDGES * lengths, _cuboid(), "cuboid"
     return Mesh((unit.vertices * lengths) @ axes.T + centre, unit.faces, unit.painted, f"the {shape} {EQUAL}")
 
 
-def _top(mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, centre: np.ndarray, pinned: bool) -> Mesh:
+def _top_mesh(
+    mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, centre: np.ndarray, pinned: bool
+) -> Mesh:
     """The homogeneous cylinder, or ball, of these moments, on a stem if its pivot lies on the axis outside of it.
 
     A cylinder has m r²/2 about its axis and m (3 r² + h²)/12 about the others: there is one for any two moments.
@@ -105,39 +107,39 @@ def _top(mass: float, moments: np.ndarray, axes: np.ndarray, symmetric: int, cen
         half, rings = radius, [(radius * np.sin(a), radius * np.cos(a)) for a in np.linspace(np.pi, 0, 13)]
     else:
         radius, height = float(np.sqrt(2 * along / mass)), float(np.sqrt(max(12 * across - 6 * along, 0.0) / mass))
-        radius, half = max(radius, THIN * height), max(height, THIN * 2 * radius) / 2
+        radius, half = max(radius, MIN_THICKNESS * height), max(height, MIN_THICKNESS * 2 * radius) / 2
         rings = [(radius, -half), (radius, half)]
     about = f"the {'ball' if is_ball else 'cylinder'} {EQUAL}"
     stem = pinned and far > half and float(axis @ centre) > (1 - EQUAL_MOMENTS) * far
     if stem:
-        thick = min(STEM * far, 0.5 * radius)
+        thick = min(STEM_THICKNESS * far, 0.5 * radius)
         if is_ball:
             rings[0] = (thick, -float(np.sqrt(radius**2 - thick**2)))
         rings = [(0.0, -far), (thick, min(2 * thick - far, rings[0][1])), (thick, rings[0][1]), *rings[is_ball:]]
         about += ", on a stem"
-    unit = _stack(rings)
+    unit = _revolve(rings)
     frame = np.stack([right, np.cross(axis, right), axis])
     return Mesh(unit.vertices @ frame + centre, unit.faces, unit.painted, about, stem)
 
 
-def _of_points(places: np.ndarray, masses: np.ndarray) -> Mesh:
-    """Balls at the points, as large as their masses tell, and rods between the nearest of them."""
+def _points_mesh(positions: np.ndarray, masses: np.ndarray) -> Mesh:
+    """Balls at the points, with sizes by their masses, and rods between nearest points."""
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import cdist
 
-    far = cdist(places, places)
-    size = max(far.max(), np.linalg.norm(places, axis=1).max())
+    far = cdist(positions, positions)
+    size = max(far.max(), np.linalg.norm(positions, axis=1).max())
     parts = []
-    for place, mass in zip(places, masses, strict=True):
+    for position, mass in zip(positions, masses, strict=True):
         unit = _ball()
         radius = 0.09 * size * (mass / masses.max()) ** (1 / 3) if size > 0 else 1.0
-        parts.append((unit.vertices * max(radius, 0.02 * size) + place, unit))
+        parts.append((unit.vertices * max(radius, 0.02 * size) + position, unit))
     tree = minimum_spanning_tree(far).tocoo()
     for i, j in zip(tree.row, tree.col, strict=True):
-        unit, along = _cylinder(), places[j] - places[i]
+        unit, along = _cylinder(), positions[j] - positions[i]
         right = unit_vector(np.cross(along, np.eye(3)[np.abs(along).argmin()]))
         frame = np.stack([0.02 * size * right, 0.02 * size * unit_vector(np.cross(along, right)), along])
-        parts.append((unit.vertices @ frame + (places[i] + places[j]) / 2, unit._replace(painted=[False] * 99)))
+        parts.append((unit.vertices @ frame + (positions[i] + positions[j]) / 2, unit._replace(painted=[False] * 99)))
     faces, painted, start = [], [], 0
     for vertices, unit in parts:
         faces += [[start + corner for corner in face] for face in unit.faces]
@@ -146,42 +148,49 @@ def _of_points(places: np.ndarray, masses: np.ndarray) -> Mesh:
     return Mesh(np.concatenate([vertices for vertices, _ in parts]), faces, painted, "its points, joined")
 
 
-def _stack(rings: list[tuple[float, float]]) -> Mesh:
+def _revolve(rings: list[tuple[float, float]]) -> Mesh:
     """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its side is painted."""
-    angle = 2 * np.pi * np.arange(ROUND) / ROUND
+    angle = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    vertices = np.concatenate([np.column_stack([r * circle, np.full(ROUND, z)]) for r, z in rings])
+    vertices = np.concatenate([np.column_stack([r * circle, np.full(CIRCLE_CORNERS, z)]) for r, z in rings])
     faces, painted = [], []
     for k in range(len(rings) - 1):
-        for i in range(ROUND):
-            j = (i + 1) % ROUND
-            faces.append([k * ROUND + i, k * ROUND + j, (k + 1) * ROUND + j, (k + 1) * ROUND + i])
-            painted.append(i < ROUND // 4)
+        for i in range(CIRCLE_CORNERS):
+            j = (i + 1) % CIRCLE_CORNERS
+            faces.append(
+                [
+                    k * CIRCLE_CORNERS + i,
+                    k * CIRCLE_CORNERS + j,
+                    (k + 1) * CIRCLE_CORNERS + j,
+                    (k + 1) * CIRCLE_CORNERS + i,
+                ]
+            )
+            painted.append(i < CIRCLE_CORNERS // 4)
     for k, order in ((0, -1), (len(rings) - 1, 1)):
         if rings[k][0] > 0:
-            ends = list(range(k * ROUND, (k + 1) * ROUND))
-            wedge = ends[: ROUND // 4 + 1]
+            ends = list(range(k * CIRCLE_CORNERS, (k + 1) * CIRCLE_CORNERS))
+            wedge = ends[: CIRCLE_CORNERS // 4 + 1]
             middle = len(vertices)
             vertices = np.vstack([vertices, [0.0, 0.0, rings[k][1]]])
-            faces += [[middle, *wedge][::order], [middle, *ends[ROUND // 4 :], ends[0]][::order]]
+            faces += [[middle, *wedge][::order], [middle, *ends[CIRCLE_CORNERS // 4 :], ends[0]][::order]]
             painted += [True, False]
     return Mesh(vertices, faces, painted, "")
 
 
 def _ball() -> Mesh:
     polar = np.linspace(np.pi, 0, 13)
-    return _stack([(np.sin(a), np.cos(a)) for a in polar])
+    return _revolve([(np.sin(a), np.cos(a)) for a in polar])
 
 
-_cylinder, _rod = partial(_stack, [(1.0, -0.5), (1.0, 0.5)]), partial(_stack, [(0.5, -0.5), (0.5, 0.5)])
-_cone = partial(_stack, [(0.0, -0.75), (1.0, 0.25)])
+_cylinder, _rod = partial(_revolve, [(1.0, -0.5), (1.0, 0.5)]), partial(_revolve, [(0.5, -0.5), (0.5, 0.5)])
+_cone = partial(_revolve, [(0.0, -0.75), (1.0, 0.25)])
 
 
 def _ring() -> Mesh:
-    """A ring of unit radius about axis 3, as a tube whose thickness the body's own, THIN, sets along axis 3."""
-    turn = np.linspace(0, 2 * np.pi, 9)[:-1]
-    tube = _stack([(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*turn, turn[0]]])
-    sides = ROUND * (len(turn))
+    """A ring of unit radius about axis 3, as a tube, whose thickness along the axis is MIN_THICKNESS."""
+    angle = np.linspace(0, 2 * np.pi, 9)[:-1]
+    tube = _revolve([(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*angle, angle[0]]])
+    sides = CIRCLE_CORNERS * (len(angle))
     return Mesh(tube.vertices, tube.faces[:sides], tube.painted[:sides], "")
 
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.figures.style import COOL, FAINT, INK, save_figure, settings
-from rigidmd.io.connections import COVALENT, bonds
+from rigidmd.io.bonds import COVALENT, bonds
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import Molecule
 from rigidmd.view.molecule_text import short_source
 
-ENDINGS = (".png", ".svg", ".pdf")
+EXTENSIONS = (".png", ".svg", ".pdf")
 #: Colours of the elements, after Corey, Pauling and Koltun, and of all others.
 COLOURS = {
     "H": "#f0f0f0", "C": "#5a5f66", "N": "#3f63d6", "O": "#d8392f", "F": "#7cc95a", "S": "#e3bf2b", "Cl": "#3fa34d",
@@ -34,10 +34,10 @@ class _Sphere(NamedTuple):
 
 
 def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
-    """Draw a molecule into a file; the ending sets the format. Raises OutputError."""
+    """Draw a molecule into a file, whose extension sets the format. Raises OutputError."""
     from rigidmd.figures.picture import Picture
 
-    check_target(path, ENDINGS, force, "figure")
+    check_target(path, EXTENSIONS, force, "figure")
     view = _view(m)
     seen = m.positions_body @ view.T  # right, up, towards the viewer
     spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]
@@ -58,17 +58,17 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     axes.text(corner[0], corner[1] + 0.03 * half, f"{length:g} Å", color=INK, fontsize=FONT, ha="left", va="bottom")
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
     figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
-    told = [f"{m.name}: {m.description}"]
+    lines = [f"{m.name}: {m.description}"]
     if m.radius > 0:
-        told.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
+        lines.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     legend = [
         (short_source(m), bool(m.source)),
         ("charges in e", m.charges.any()),
         ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()),
         ("diamonds: massless sites", (m.masses == 0).any()),
     ]
-    told.append("; ".join(text for text, there in legend if there))
-    figure.text(0.03, 0.942, "\n".join(told), fontsize=FONT, linespacing=1.35, **plain)
+    lines.append("; ".join(text for text, there in legend if there))
+    figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
     with settings({"svg.hashsalt": m.name}), atomic_file(path) as temporary:
         metadata = {"Date": None} if path.suffix == ".svg" else None
         save_figure(figure, temporary, dpi=150, metadata=metadata)
@@ -85,7 +85,6 @@ def _view(m: Molecule) -> np.ndarray:
 
 
 def _radius(m: Molecule, i: int) -> float:
-    """Å."""
     if m.masses[i] == 0:
         return LEAST / 2
     covalent = COVALENT.get(m.elements[i])
@@ -111,7 +110,7 @@ def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
 
 
 def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[tuple]:
-    """Draw bonds from surface to surface. Returns points that labels must not cover."""
+    """Draw bonds between the surfaces of spheres. Returns points that labels must not cover."""
     taken = []
     for i, j in bonds(m):
         if m.masses[j] == 0:
@@ -143,10 +142,10 @@ def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
     base, steps = np.array(to_rgb(_colour(m, i))), 24
     (x, y), towards_light = sphere.centre, (-0.32 * sphere.radius, 0.36 * sphere.radius)
     for k in range(steps):
-        share = k / (steps - 1)  # from the dark rim to the light spot
-        colour = np.clip(base * (0.72 + 0.33 * share) + 0.55 * max(0.0, share - 0.45) ** 2, 0, 1)
-        centre = x + share * towards_light[0], y + share * towards_light[1]
-        spot = Circle(centre, sphere.radius * (1 - 0.93 * share), fc=colour, lw=0)
+        fraction = k / (steps - 1)  # from the dark rim to the light spot
+        colour = np.clip(base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1)
+        centre = x + fraction * towards_light[0], y + fraction * towards_light[1]
+        spot = Circle(centre, sphere.radius * (1 - 0.93 * fraction), fc=colour, lw=0)
         spot.set_zorder(order)
         axes.add_patch(spot)
     axes.add_patch(Circle(sphere.centre, sphere.radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
@@ -175,7 +174,7 @@ def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tu
 
 
 def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[tuple]) -> None:
-    """Names and charges in the first free direction, tried from outward on."""
+    """Draw names and charges in the first free direction, from outward on."""
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
     for i in sorted(range(len(spheres)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(spheres[i].centre))):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
@@ -184,8 +183,8 @@ def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[
         outward = np.arctan2(y, x) if np.hypot(x, y) > 1e-6 * half else -np.pi / 2
         best = None
         for gap in (0.02, 0.08, 0.16, 0.26, 0.38, 0.52):
-            for turn in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6, 7, -7, 8):
-                angle = outward + turn * np.pi / 8
+            for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6, 7, -7, 8):
+                angle = outward + step * np.pi / 8
                 way = np.array([np.cos(angle), np.sin(angle)])
                 centre = spheres[i].centre + way * (spheres[i].radius + gap * half) + way * size / 2
                 box = (*(centre - size / 2), *(centre + size / 2))

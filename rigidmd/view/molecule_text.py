@@ -1,4 +1,4 @@
-"""Models in words: the list of all, and one with its geometry, parameters and source."""
+"""Molecular models as text: a table of all, or one with its geometry, parameters and source."""
 
 import re
 import textwrap
@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from rigidmd.io.connections import _distance, bonds
+from rigidmd.io.bonds import _distance, bonds
 from rigidmd.scene.models import GROUPS, Molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -51,8 +51,8 @@ def molecule_text(m: Molecule) -> str:
     if m.kind == "linear" and m.charges.any() and not m.charge:
         lines.append(f"  quadrupole along the axis {m.quadrupole_debye_A[0, 0]:+.4f} D Å")
     lines += ["", *_sites(m), "", *_geometry(m)]
-    said = [("mixing", m.mixing), ("note", m.note), ("source", m.source)]
-    for name, text in said:
+    details = [("mixing", m.mixing), ("note", m.note), ("source", m.source)]
+    for name, text in details:
         if text:
             lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
     if m.residue_names:

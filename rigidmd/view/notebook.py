@@ -1,4 +1,4 @@
-"""What scenes, simulations and results show of themselves in a notebook, light or dark: a table and a figure."""
+"""The display of scenes, simulations and results in a notebook, light or dark: a table and a figure."""
 
 import html
 from collections.abc import Iterable
@@ -23,69 +23,71 @@ from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.view.page import Raw, figure, notes, table
 
 STYLE = Path(__file__).with_name("notebook.css").read_text(encoding="utf-8")
-#: What acts on a body: a table of its scene, and what it is called.
+#: What acts on a body: a table of its scene, and its title.
 ACTING = {"gravity": "gravity", "applied": "applied forces", "friction": "friction", "fluid": "a fluid",
           "frame": "a moving frame", "wheels": "wheels", "changing_inertia": "changing inertia"}  # fmt: skip
 COULOMB = {"reaction_field": "reaction field", "ewald": "Ewald sum", "pme": "particle mesh Ewald",
            "damped_shifted_force": "damped shifted force", "none": "charges ignored"}  # fmt: skip
-OWN = "own forces"
+USER_FORCES = "user forces"
 
-Row = tuple[str, str]
+TableRow = tuple[str, str]
 
 
 @html_of.register
 def scene_html(scene: Scene) -> str:
-    """What a scene is: molecules, box, forces, stages; of a body its kind, moments, start and method."""
-    return _shown(scene.name, _kind(scene), _table(_rows(scene)))
+    """A scene: molecules, box, forces, stages, or the kind, moments, start and method of a body."""
+    return _framed(scene.name, _kind(scene), _table(_rows(scene)))
 
 
 @html_of.register
 def simulation_html(simulation: Simulation) -> str:
-    """The scene, who looks at the run, and where it writes."""
+    """The scene, the observers, and where the run writes."""
     folder = simulation.folder
     where = "nowhere: the results stay in memory" if folder is None else str(folder)
-    own = [(OWN, f"{name}: {words}") for name, words in getattr(simulation.system, "own", {}).items()]
-    rows = [*(row for row in _rows(simulation.scene) if row[0] != OWN), *own]
+    user_rows = [
+        (USER_FORCES, f"{name}: {words}") for name, words in getattr(simulation.system, "user_terms", {}).items()
+    ]
+    rows = [*(row for row in _rows(simulation.scene) if row[0] != USER_FORCES), *user_rows]
     rows += [("threads", str(simulation.threads)), ("writes to", where)]
     if names := [type(observer).__name__ for observer in simulation._observers]:
         rows.append(("observers", ", ".join(names)))
-    return _shown(simulation.scene.name, "ready to run: run() does it", _table(rows))
+    return _framed(simulation.scene.name, "ready to run: run() does it", _table(rows))
 
 
 @html_of.register
 def results_html(results: Results) -> str:
     """The summary, the first figure of the run, notes, and a list of all columns."""
     summary = results.summary
-    told = []
+    text = []
     if isinstance(results.system, BodySystem):
-        told += [f"<p>{html.escape(body_title(summary))}</p>", _table(body_rows(summary))]
+        text += [f"<p>{html.escape(body_title(summary))}</p>", _table(body_rows(summary))]
     else:
         for stage in summary["stages"]:
-            told += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]
+            text += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]
     drawn = run_figures(results.system, results.samples, summary)
-    left = f"<div>{''.join(told)}{notes(summary['notes'])}</div>"
+    left = f"<div>{''.join(text)}{notes(summary['notes'])}</div>"
     name, first = next(iter(drawn.items()), ("", None))
     right = "" if first is None else f"<div>{_svg(first, name, results)}</div>"
     body = f'<div class="sides">{left}{right}</div>{_columns(results)}'
-    return _shown(results.system.scene.name, results._summary_line, body)
+    return _framed(results.system.scene.name, results._summary_line, body)
 
 
-def _shown(name: str, about: str, body: str) -> str:
+def _framed(name: str, about: str, body: str) -> str:
     head = f'<div class="head">{html.escape(name)} <span class="faint">{html.escape(about)}</span></div>'
     return f'<style>{STYLE}</style><div class="rigidmd">{head}{body}</div>'
 
 
-def _table(rows: Iterable[Row]) -> str:
-    """Rows, of which those of the same name tell it once."""
-    told, before = [], ""
+def _table(rows: Iterable[TableRow]) -> str:
+    """A table in which equal names in successive rows appear once."""
+    text, before = [], ""
     for name, value in rows:
-        told.append(("" if name == before else name, value))
+        text.append(("" if name == before else name, value))
         before = name
-    return table([], told, words=True)
+    return table([], text, words=True)
 
 
 def _svg(drawn, name: str, results: "Results") -> str:
-    """A figure whose colours are those of the notebook; one with a lit solid is on white, dark or not."""
+    """A figure in the colours of the notebook, or on white if it has a shaded solid."""
     found = figure(drawn, f"{results.system.scene.name}-{name}", f"figure: {name}").replace("#000000", "var(--ink)")
     found = found.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
     return f'<div class="{"paper" if "<image" in found else "figure"}">{found}</div>'
@@ -95,8 +97,8 @@ def _kind(scene: Scene) -> str:
     return "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
 
 
-def _rows(scene: Scene) -> list[Row]:
-    """Name and value of what a scene says. What is wrong with a scene that cannot be built is one of them."""
+def _rows(scene: Scene) -> list[TableRow]:
+    """Names and values of a scene, or its errors if it cannot be built."""
     try:
         if isinstance(scene, BodyScene):
             return list(_body_rows(build_body(scene)))
@@ -105,7 +107,7 @@ def _rows(scene: Scene) -> list[Row]:
         return [("this scene", scene.in_short), *(("fault", fault) for fault in error.errors)]
 
 
-def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
+def _molecular_rows(scene: MolecularScene) -> Iterable[TableRow]:
     species = species_of(scene)
     for entry, molecule in zip(scene.molecules, species, strict=True):
         count = f"{entry.count} " if entry.count else ""
@@ -120,7 +122,7 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[Row]:
     acting += [f"cutoff {forces.cutoff_A:g} Å"] if forces.cutoff_A and acting else []
     yield "forces", ", ".join(acting) or "none of the models"
     for force in forces.custom:
-        yield OWN, f"{force.name}: {force.energy or force.module}"
+        yield USER_FORCES, f"{force.name}: {force.energy or force.module}"
     for name in type(scene.fields).model_fields:
         if getattr(scene.fields, name):
             yield "fields", name.replace("_", " ")
@@ -137,10 +139,10 @@ def _box(scene: MolecularScene) -> str:
     if box.lengths_A is not None:
         lengths = box.lengths_A if isinstance(box.lengths_A, tuple) else (box.lengths_A,) * 3
         return f"periodic, {' x '.join(f'{length:g}' for length in lengths)} Å"
-    return "periodic, that of the structure file"
+    return "periodic, from the structure file"
 
 
-def _body_rows(system: BodySystem) -> Iterable[Row]:
+def _body_rows(system: BodySystem) -> Iterable[TableRow]:
     scene, run = system.scene, system.scene.run
     pinned = "" if system.translates else ", pinned"
     yield "body", f"{system.kind}{pinned}, {system.mass:g} kg, {system.degrees_of_freedom} degrees of freedom"
@@ -150,10 +152,10 @@ def _body_rows(system: BodySystem) -> Iterable[Row]:
         pose = system.pose(0.0, system.state)
         angles = ", ".join(f"{x + 0.0:.6g}°" for x in np.degrees(to_euler_angles(pose.rotation)).round(9))
         spin = float(np.linalg.norm(pose.angular_velocity_body))
-        turn = "at rest"
+        motion = "at rest"
         if spin * run.duration_s > 1e-6:
-            turn = f"turning at {spin:.6g} rad/s, {2 * np.pi / spin / run.timestep_s:.3g} steps a turn"
-        yield "start", f"φ, θ, ψ = {angles}; {turn}"
+            motion = f"rotating at {spin:.6g} rad/s, {2 * np.pi / spin / run.timestep_s:.3g} steps per rotation"
+        yield "start", f"φ, θ, ψ = {angles}; {motion}"
     if acting := [word for name, word in ACTING.items() if getattr(scene, name)]:
         yield "acting", ", ".join(acting)
     yield "run", f"{run.duration_s:g} s in {run.steps} steps of {run.timestep_s:g} s"
@@ -176,7 +178,7 @@ def _columns(results: "Results") -> str:
 
 
 def _ends(results: "Results", columns: list[str]) -> str:
-    """First and last value of a scalar column."""
+    """First and last value of a scalar column, as text."""
     values = results[columns[0]]
     if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
         return ""

@@ -16,11 +16,11 @@ STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 def page(title: str, parts: Iterable[str], head: str = "") -> str:
     """A whole page of HTML parts under a title (plain text). `head` is added to its head: more style or scripts."""
-    told = html.escape(title)
+    title_html = html.escape(title)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{told}</title>\n<style>{STYLE}</style>{head}</head>\n<body>\n<h1>{told}</h1>\n"
+        f"<title>{title_html}</title>\n<style>{STYLE}</style>{head}</head>\n<body>\n<h1>{title_html}</h1>\n"
         + "\n".join(part for part in parts if part)
         + "\n</body></html>\n"
     )

@@ -1,17 +1,30 @@
-"""Plots of the columns of a run against its time, as small figures for a page, which a film can put a cursor on."""
+"""Plots of the columns of a run against time: small ones for pages, where animations add a cursor, and figures."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, bare_axis, shown_range, thin_series
+from rigidmd.engines.body_motion import Motion
+from rigidmd.engines.body_system import BodySystem
+from rigidmd.engines.samples import MATRIX, Column, Samples
+from rigidmd.engines.system import System
+from rigidmd.figures.picture import Picture
+from rigidmd.figures.run import run_figures
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, open_axis, shown_range, thin_series
 from rigidmd.run.record import Record
+from rigidmd.scene.validation import did_you_mean
 from rigidmd.view.page import figure as figure_part
 
-#: Inches: narrow, so that its letters can be read on a phone.
+if TYPE_CHECKING:
+    from rigidmd.figures.picture import Picture
+    from rigidmd.run.results import Results
+
+#: Inches: narrow, to be readable on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
 COLORS = (COOL, WARM, "#4f8a5b", "#7a5ca3", "#b8862d")
-#: Errors of exactly zero are drawn here.
+#: Errors of exactly 0 are drawn at this value.
 FLOOR = 1e-17
 
 
@@ -25,11 +38,11 @@ class Panel(NamedTuple):
 
 def panels(record: Record) -> list[Panel]:
     """The plots of a run."""
-    found = _of_body(record) if record.is_body else _of_molecules(record)
+    found = _body_panels(record) if record.is_body else _molecular_panels(record)
     return [panel for panel in found if panel.curves]
 
 
-def _of_molecules(record: Record) -> list[Panel]:
+def _molecular_panels(record: Record) -> list[Panel]:
     seen, n, shown = record.columns, len(record.molecules.model.species), record.moving
 
     def curves(*names: tuple[str, str], per: int = 1) -> list[tuple[str, np.ndarray]]:
@@ -39,8 +52,7 @@ def _of_molecules(record: Record) -> list[Panel]:
 
     found = [
         Panel(
-            "temperature (K)",
-            curves(("temperature_translation", "translation"), ("temperature_rotation", "rotation")),
+            "temperature (K)", curves(("temperature_translation", "translation"), ("temperature_rotation", "rotation"))
         ),
         Panel("potential energy (kJ/mol per molecule)", curves(("potential", ""), per=n)),
         Panel("drift of the conserved energy in a stage (kJ/mol per molecule)", curves(("drift", ""), per=n)),
@@ -52,7 +64,7 @@ def _of_molecules(record: Record) -> list[Panel]:
     return found
 
 
-def _of_body(record: Record) -> list[Panel]:
+def _body_panels(record: Record) -> list[Panel]:
     seen = record.columns
     found = []
     if "theta" in seen:
@@ -63,7 +75,7 @@ def _of_body(record: Record) -> list[Panel]:
         found.append(Panel(f"φ and ψ ({unit})", [(name, values / size) for name, values in angles]))
         omega = [("₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
         found.append(Panel("ω along the body's axes (rad/s)", [(f"ω{k}", values) for k, values in omega]))
-    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.body.flies:
+    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.body.translates:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
     found.append(Panel("energies (J)", parts))
@@ -77,8 +89,8 @@ def _of_body(record: Record) -> list[Panel]:
 
 
 def draw(record: Record) -> str:
-    """All plots as HTML. Each tells the film where its axis lies: data-left and data-right as shares of its width,
-    data-from and data-to in the run's time."""
+    """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the time axis as fractions
+    of the width, data-from and data-to, its limits."""
     return f'<div class="plots">{"".join(_draw(record, k, panel) for k, panel in enumerate(panels(record)))}</div>'
 
 
@@ -91,14 +103,14 @@ def _draw(record: Record, k: int, panel: Panel) -> str:
     axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
     axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
     svg = figure_part(figure, f"panel{k}", panel.title)
-    place = axis.get_position()
+    box = axis.get_position()
     left, right = axis.get_xlim()
-    where = f'data-left="{place.x0:.5f}" data-right="{place.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
+    where = f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
     return f"<figure {where}>{svg}</figure>"
 
 
 def draw_panel(axis, record: Record, panel: Panel) -> None:
-    """Draw the curves of a panel where time passes, with the beginnings of stages."""
+    """Draw the curves of a panel, without minimisations, with the beginnings of stages."""
     shown, ranges = record.moving, []
     time, stages = record.time[shown], record.columns.get("stage", np.zeros(len(shown)))[shown]
     for color, (label, values) in zip(COLORS * len(panel.curves), panel.curves, strict=False):
@@ -113,7 +125,79 @@ def draw_panel(axis, record: Record, panel: Panel) -> None:
     for k in np.flatnonzero(stages[1:] != stages[:-1]):
         axis.axvline(time[k], color=FAINT, lw=0.6, ls=":")
     axis.margins(x=0)
-    bare_axis(axis, labelsize=8)
+    open_axis(axis, labelsize=8)
     if len(panel.curves) > 1:
         axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02), handlelength=1.2,
                     borderaxespad=0.2, labelcolor=INK)  # fmt: skip
+
+
+#: Inches: width of a figure, height of a panel, height of labels around the panels.
+FIGURE_WIDTH, PANEL_HEIGHT, FIGURE_MARGIN = 7.2, 2.0, 0.6
+
+
+def record_of(
+    system: System | BodySystem,
+    samples: Samples | Motion,
+    summary: dict[str, Any] | None,
+    names: Sequence[str] | None = None,
+) -> Record:
+    """A run in memory as a record, with all its columns or with the named ones and the time."""
+    if isinstance(samples, Motion):
+        columns = samples.columns if names is None else {name: samples.columns[name] for name in ["time", *names]}
+    else:
+        wanted = samples.described if names is None else dict.fromkeys(["time", "stage", *names])
+        columns = {name: samples[name] for name in wanted}
+    return Record(Path(), system.scene, system, summary, columns, [])
+
+
+def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Picture":
+    """The figure of these columns, the named figure, or the first figure of the run. Raises KeyError."""
+    figures = {}
+    if not set(names[:1]) & set(results.units):
+        figures = run_figures(results.system, results.samples, results.summary)
+    if not names:
+        if not figures:
+            raise ValueError(f"too few samples for a figure: {len(results.samples)}")
+        return next(iter(figures.values()))
+    if len(names) == 1 and names[0] in figures:
+        return figures[names[0]]
+    check_names(names, results.samples.described, figures)
+    record = record_of(results.system, results.samples, results.summary, list(names))
+    return columns_figure(record, names, results.samples.described, log)
+
+
+def check_names(names: Sequence[str], described: dict[str, Column], figures: Any = ()) -> None:
+    """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
+    known = [name for name, column in described.items() if column.unit and name != MATRIX]
+    for name in names:
+        if name in known:
+            continue
+        if name in described:
+            raise KeyError(f"column {name!r} has {'matrices' if name == MATRIX else 'text'}, which are not plotted")
+        hint = did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"
+        raise KeyError(f"no column {name!r}{hint}")
+
+
+def columns_figure(record: Record, names: Sequence[str], described: dict[str, Column], log: bool = False) -> Picture:
+    """Columns against time, with one panel for each unit."""
+    units: dict[str, list[str]] = {}
+    for name in dict.fromkeys(names):
+        units.setdefault(described[name].unit, []).append(name)
+    figure = Picture(figsize=(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN), layout="constrained")
+    axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (unit, members) in zip(axes, units.items(), strict=True):
+        title = axis_label(members[0], unit) if len(members) == 1 else ""
+        suffix = "" if unit == "1" else f"{' ' * bool(title)}({unit})" if title else unit
+        curves = [(axis_label(name, unit), record.columns[name]) for name in members]
+        draw_panel(axis, record, Panel("", [(label, np.abs(y) if log else y) for label, y in curves], log))
+        if len(members) > 1:
+            axis.legend(frameon=False, fontsize=8, labelcolor=INK)
+        axis.set_ylabel(f"{title}{suffix}", fontsize=9, color=INK)
+    axes[-1].set_xlabel(f"time ({record.time_unit})", fontsize=9, color=INK)
+    figure.suptitle(record.scene.name, color=INK, x=0.01, ha="left", fontsize=11)
+    return figure
+
+
+def axis_label(name: str, unit: str) -> str:
+    """The name of a column without its unit, for an axis: pressure_bar is the pressure in bar."""
+    return name.removesuffix(f"_{unit}").replace("_", " ")

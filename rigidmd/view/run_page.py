@@ -1,4 +1,4 @@
-"""The page of a run without its film: what was simulated, means with errors, plots, margins, files, how to repeat."""
+"""The page of a run, without animation: system, means with errors, plots, stability margins, files, how to repeat."""
 
 import html
 import shlex
@@ -10,7 +10,7 @@ import numpy as np
 from rigidmd.analysis.files import draw_curve, read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
-from rigidmd.core.statistics import format_signed, format_with_error, mean
+from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
 from rigidmd.io.folder import SCENE
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
@@ -26,15 +26,15 @@ MEANS = (
     ("pressure_bar", "P (bar)", False),
     ("density", "density (g/cm³)", False),
 )
-#: What a summary tells of the machine and the programs, and what went in.
-KNOWN = (
+#: Keys of a summary on programs, machine and input, and their titles.
+PROVENANCE = (
     ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
     ("numpy_version", "NumPy"), ("python_version", "Python"), ("machine", "machine"), ("processor", "processor"),
     ("vector_bits", "bits of a vector"), ("numba_settings", "settings of Numba"), ("threads", "threads"),
     ("precision", "precision"), ("seed", "seed"), ("scene_sha256", "SHA-256 of the scene"),
     ("input_sha256", "SHA-256 of the files that it read"),
 )  # fmt: skip
-#: Files of a run: ending or name -> what is in it.
+#: Files of a run: name -> contents.
 ABOUT = {
     "scene.toml": "the scene with all defaults: it repeats the run to the bit",
     "summary.json": "the values of this page",
@@ -44,33 +44,33 @@ ABOUT = {
     "final.npz": "the last state, every bit of it",
     "pressure_tensor.csv": "the pressure tensor over time, for a viscosity",
     "analysis.json": "values of `rigidmd analyse` with their errors",
-    "checkpoint.npz": "from which `rigidmd resume` goes on",
+    "checkpoint.npz": "from which `rigidmd resume` continues",
     "checkpoint_previous.npz": "the checkpoint before it",
     "last_good_state.npz": "the last state before the run failed",
 }
 
 
 def write_report(folder: Path, path: Path) -> tuple[Path, list[str]]:
-    """Write the page of the run in a folder. Returns its path, and what is missing. Raises OutputError."""
+    """Write the page of the run in a folder. Returns its path, and notes on missing data. Raises OutputError."""
     record = read_record(folder)
     write_text(path, page(f"{record.scene.name}: a run of rigidmd", parts(record)))
     return path, record.missing
 
 
-def parts(record: Record, film: str = "") -> Iterator[str]:
-    """The parts of the page, as HTML. film: what stands in the place of the plots, with them."""
+def parts(record: Record, animation: str = "") -> Iterator[str]:
+    """The parts of the page, as HTML. animation : HTML with the plots"""
     yield f'<p class="faint">{html.escape(record.scene.in_short)}</p>'
     yield notes([*record.missing, *(record.summary or {}).get("notes", ())])
-    yield film
+    yield animation
     if record.is_body:
         yield section("Results", _body_table(record))
     else:
         yield section("Means of each stage", _means(record), _drifts(record))
-    if not film:
+    if not animation:
         yield section("Plots", plots.draw(record))
     yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
-    simulated, left_out = _told(record)
+    simulated, left_out = _scene_description(record)
     yield section("What was simulated", code(simulated))
     yield section("What was left out, and why", items(left_out))
     yield section("Files", _files(record))
@@ -78,33 +78,30 @@ def parts(record: Record, film: str = "") -> Iterator[str]:
 
 
 def _means(record: Record) -> str:
-    """Means of the log with their standard errors, which account for correlation."""
+    """Means of the log with their standard errors."""
     n, seen = len(record.molecules.model.species), record.columns
     shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
     rows = []
     for k in np.unique(seen["stage"][record.moving]):
-        own = np.flatnonzero(seen["stage"] == k)
-        time = seen["time"][own]
-        cells = [
-            seen["stage_name"][own[0]],
-            f"{time[-1] - (seen['time'][own[0] - 1] if own[0] else time[0]):g}",
-            len(own),
-        ]
+        of_stage = np.flatnonzero(seen["stage"] == k)
+        time = seen["time"][of_stage]
+        begin = seen["time"][of_stage[0] - 1] if of_stage[0] else time[0]
+        cells = [seen["stage_name"][of_stage[0]], f"{time[-1] - begin:g}", len(of_stage)]
         for column, _, per_molecule in shown:
-            values = seen[column][own] / (n if per_molecule else 1)
+            values = seen[column][of_stage] / (n if per_molecule else 1)
             if np.ptp(values) <= 1e-9 * np.abs(values).max():
                 cells.append(f"{values[0]:.6g}")
                 continue
-            value, error = mean(values)
+            value, error = mean_and_error(values)
             cells.append("" if value is None else format_with_error(value, error))
         rows.append(cells)
-    told = "Means over a whole stage ± one standard error, from log.csv; none of minimisations, of few lines no error."
-    told = f'<p class="faint">{told}</p>'
-    return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + told
+    text = "Means over a whole stage ± one standard error, from log.csv, without minimisations; few rows have no error."
+    text = f'<p class="faint">{text}</p>'
+    return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + text
 
 
 def _drifts(record: Record) -> str:
-    """Drift of the conserved energy and speed, which the summary of an ended run tells."""
+    """Drift of the conserved energy and speed, from the summary of a run that has ended."""
     rows = []
     for stage in (record.summary or {}).get("stages", ()):
         cells = [stage["name"], stage.get("integrator"), _number(stage.get("timestep_fs"))]
@@ -120,24 +117,24 @@ def _drifts(record: Record) -> str:
 
 
 def _analyses(record: Record) -> Iterator[str]:
-    """What `rigidmd analyse` found: values, what was left out, figures."""
-    rows, left_out, figures, stretches = [], [], [], []
-    for finding, stretch in read_results(record.folder):
-        for value in finding.values:
-            told = "" if value.value is None else format_with_error(value.value, value.error)
+    """Results of `rigidmd analyse`: values, analyses left out, figures."""
+    rows, left_out, figures, phrases = [], [], [], []
+    for result, phrase in read_results(record.folder):
+        for value in result.values:
+            text = "" if value.value is None else format_with_error(value.value, value.error)
             time = "" if value.correlation_ps is None else f"{value.correlation_ps:.3g}"
-            rows.append([value.name, told, value.unit if told and value.unit != "1" else "", time, value.note])
-        if not finding.values and not finding.curves:
-            left_out += [f"{finding.name}: {note}" for note in finding.notes]
+            rows.append([value.name, text, value.unit if text and value.unit != "1" else "", time, value.note])
+        if not result.values and not result.curves:
+            left_out += [f"{result.name}: {note}" for note in result.notes]
         else:
-            stretches.append(stretch)
-        for curve in finding.curves:
+            phrases.append(phrase)
+        for curve in result.curves:
             svg = figure(draw_curve(curve), f"analysis-{curve.file}", curve.label)
             figures.append(f"<figure>{svg}</figure>")
     if not rows and not figures and not left_out:
         return
-    told = "; ".join(dict.fromkeys(stretches))
-    yield f'<p class="faint">Values ± one standard error, of {html.escape(told)}.</p>' if told else ""
+    text = "; ".join(dict.fromkeys(phrases))
+    yield f'<p class="faint">Values ± one standard error, of {html.escape(text)}.</p>' if text else ""
     yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
     yield "<p>Left out:</p>" + items(left_out) if left_out else ""
@@ -167,7 +164,7 @@ def _body_table(record: Record) -> str:
 
 
 def _margins(record: Record) -> str:
-    """How far each time step is from the longest stable one."""
+    """Time steps compared with the longest stable ones."""
     summary, rows = record.summary or {}, []
     if record.is_body:
         stages = [{"name": record.scene.name, **summary}] if summary else []
@@ -176,24 +173,24 @@ def _margins(record: Record) -> str:
         stages, step, stable, unit = summary.get("stages", ()), "timestep_fs", "stable_timestep_fs", "fs"
     for stage in stages:
         if stage.get(step) and stage.get(stable):
-            share = stage[step] / stage[stable]
-            kind, word = next(entry[1:] for entry in MARGINS if share <= entry[0])
+            fraction = stage[step] / stage[stable]
+            kind, word = next(entry[1:] for entry in MARGINS if fraction <= entry[0])
             rows.append(
-                [stage["name"], f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * share:.2g} %",
+                [stage["name"], f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * fraction:.2g} %",
                  Raw(f'<span class="{kind}">{word}</span>')]
             )  # fmt: skip
     more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
-    told = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
-    titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "share", ""]
-    return table(titles, rows) + told if rows else ""
+    text = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
+    titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""]
+    return table(titles, rows) + text if rows else ""
 
 
-#: Share of the longest stable step up to which a step is good, and so on.
+#: Fraction of the longest stable step up to which a verdict holds.
 MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf"), BAD, "too long"))
 
 
-def _told(record: Record) -> tuple[str, list[str]]:
-    """What `rigidmd check` says: of the run, and what is left out."""
+def _scene_description(record: Record) -> tuple[str, list[str]]:
+    """The output of `rigidmd check`: the description of the scene, and what is left out."""
     lines = describe(record.scene, user_code=False).splitlines()
     if "left out:" not in lines:
         return "\n".join(lines), []
@@ -213,8 +210,8 @@ def _files(record: Record) -> str:
     for path in sorted(record.folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue
-        told = "a figure" if path.suffix in (".png", ".svg") else about.get(path.name, "")
-        rows.append([path.name, _size(path.stat().st_size), told])
+        text = "a figure" if path.suffix in (".png", ".svg") else about.get(path.name, "")
+        rows.append([path.name, _size(path.stat().st_size), text])
     return table(["file", "size", ""], rows, words=True)
 
 
@@ -226,8 +223,8 @@ def _size(size: float) -> str:
     return f"{size:.3g} GB"
 
 
-def _told_value(value: object) -> str:
-    """A value of the summary; digests of several files as words."""
+def _provenance_value(value: object) -> str:
+    """A value of the summary as text; digests of several files in one line."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {digest}" for key, digest in value.items())
     return str(value)
@@ -239,7 +236,9 @@ def _repeat(record: Record) -> Iterator[str]:
         f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
         f"rigidmd compare {folder} {folder}-again    # to the same bits"
     )
-    yield table([], [[name, _told_value(summary[key])] for key, name in KNOWN if summary.get(key)], words=True)
+    yield table(
+        [], [[name, _provenance_value(summary[key])] for key, name in PROVENANCE if summary.get(key)], words=True
+    )
     seconds = [f"{summary[key]:.1f} s {word}" for key, word in (("preparing_s", "to compile and prepare"),
                ("computing_s", "of steps"), ("wall_s", "in all, output included")) if summary.get(key)]  # fmt: skip
     yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""

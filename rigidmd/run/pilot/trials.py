@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidmd.core.integrators import RK4, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.core.statistics import mean, slope
+from rigidmd.core.statistics import mean_and_error, slope
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.observables import Observation
 from rigidmd.engines.ode import OdeEngine
@@ -426,6 +426,6 @@ def _average(system: TrialSystem, trial: Trial, length: float) -> None:
     for kind in ("", " half-step", " unbiased"):
         found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]
     for name, values in found.items():
-        average, error = mean(values)
+        average, error = mean_and_error(values)
         if average is not None:
             trial.averages[name] = average, np.nan if error is None else error

@@ -1,4 +1,4 @@
-"""The film of a run inside a notebook: of molecules a widget of chemiscope, of a body its page in a frame."""
+"""The animation of a run in a notebook: a widget of chemiscope for molecules, a page in a frame for a body."""
 
 import html
 from dataclasses import replace
@@ -12,25 +12,26 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.trajectory import Frames
-from rigidmd.view.body_film import body_film
-from rigidmd.view.columns import record_of
-from rigidmd.view.film_page import body_part, own
-from rigidmd.view.molecule_film import frames_of, inside, massive_bonds, thinned
+from rigidmd.view.animation_page import body_part, read_asset
+from rigidmd.view.body_animation import animate_body
+from rigidmd.view.molecule_animation import describe_thinning, frames_of, inside, massive_bonds
 from rigidmd.view.page import page
+from rigidmd.view.plots import record_of
 
 if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
 
     from rigidmd.run.results import Results
 
-#: Coordinates in a widget at most, which a notebook holds as text.
-MOST = 1_500_000
-#: Pixels: height of a frame.
+
+#: Most coordinates in a widget, which a notebook stores as text.
+MOST_COORDINATES = 1_500_000
+#: Height of a frame, pixels.
 HEIGHT = 720
 
 
-class Film:
-    """A page with a film, which a notebook shows in a frame; `page` is its HTML."""
+class AnimationPage:
+    """A page with an animation, which a notebook shows in a frame; `page` is its HTML."""
 
     def __init__(self, page: str):
         self.page = page
@@ -45,20 +46,22 @@ class Film:
         return path
 
 
-def view(results: "Results") -> "StructureWidget | Film":
-    """The film of results. Raises ImportError without chemiscope, ValueError without a trajectory."""
+def show_animation(results: "Results") -> "StructureWidget | AnimationPage":
+    """The animation of results. Raises ImportError without chemiscope, ValueError without a trajectory."""
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
-        film = body_film(record)
+        animation = animate_body(record)
         name = results.system.scene.name
-        return Film(page(name, body_part(record, film), f"<style>{own('film.css')}</style>"))
+        return AnimationPage(page(name, body_part(record, animation), f"<style>{read_asset('film.css')}</style>"))
     try:
         import chemiscope
     except ImportError:
-        raise ImportError("view() of molecules needs the extra rigidmd[view]: pip install chemiscope") from None
+        raise ImportError(
+            "rigidmd.view.show() of molecules needs the extra rigidmd[view]: pip install chemiscope"
+        ) from None
     system = results.system
     massive = np.flatnonzero(system.sites.mass > 0)
-    frames = _frames(results, system, max(2, MOST // (3 * len(massive))))
+    frames = _frames(results, system, max(2, MOST_COORDINATES // (3 * len(massive))))
     elements = [str(element) for element in system.sites.element[massive]]
     bonds = massive_bonds(system)
     structures = []
@@ -71,7 +74,7 @@ def view(results: "Results") -> "StructureWidget | Film":
     shown = chemiscope.show(
         structures,
         properties={"time": {"target": "structure", "values": frames.time.tolist(), "units": "ps"}},
-        metadata={"name": system.scene.name, "description": " ".join(thinned(frames))},
+        metadata={"name": system.scene.name, "description": " ".join(describe_thinning(frames))},
         settings={"structure": [settings]},
         mode="structure",
     )
@@ -79,9 +82,9 @@ def view(results: "Results") -> "StructureWidget | Film":
 
 
 def _frames(results: "Results", system: System, most: int) -> Frames:
-    """At most so many frames, from the files of a run, or from memory."""
+    """At most `most` frames, from the files of a run or from memory."""
     if not system.scene.output.trajectory or not results._frames:
-        raise ValueError("this run kept no frames (output.trajectory = false)")
+        raise ValueError("this run has no frames (output.trajectory = false)")
     if results.files:
         record = record_of(system, results.samples, results.summary, [])
         try:

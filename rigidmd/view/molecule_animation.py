@@ -1,0 +1,215 @@
+"""The animation of molecules: on a page by chemiscope, with 16-bit coordinates, and in files by Matplotlib."""
+
+import html
+from importlib.resources import files
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.engines.system import Sites, System
+from rigidmd.errors import OutputError
+from rigidmd.figures.style import FAINT, INK, camera
+from rigidmd.io.bonds import COVALENT, connections
+from rigidmd.io.trajectory import Frames, read_frames
+from rigidmd.run.record import Record
+from rigidmd.view.animation_page import data_part, packed, read_asset, script, stage
+from rigidmd.view.molecule_figure import COLOURS, OTHER
+
+#: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
+MOST_COORDINATES = 8_000_000
+#: The JavaScript of chemiscope inside its package.
+SCRIPT = ("sphinx", "static", "chemiscope.min.js")
+#: Largest rounding error of a distance within a molecule in a trajectory, Å.
+MAX_DEVIATION = 0.05
+#: Largest 16-bit number.
+LARGEST_INTEGER = 32_767
+
+
+def chemiscope_script() -> str:
+    """The JavaScript of chemiscope. Raises OutputError if it is not installed."""
+    try:
+        return files("chemiscope").joinpath(*SCRIPT).read_text(encoding="utf-8")
+    except (ImportError, OSError):
+        raise OutputError("the animation of molecules needs the extra rigidmd[view]: pip install chemiscope") from None
+
+
+def frames_of(record: Record, most: int) -> Frames:
+    """Frames of the trajectory of a run of molecules, each molecule whole and inside the box. Raises OutputError."""
+    path, sites = record.trajectory, record.molecules.sites
+    found = read_frames(path, len(sites.molecule), most)
+    _check_shapes(path, sites, found.positions[0])
+    return inside(found, sites)
+
+
+def inside(frames: Frames, sites: Sites) -> Frames:
+    """The frames with the centre of each molecule inside the box; molecules stay whole."""
+    if frames.cells is None:
+        return frames
+    centre = np.stack([_centres(frame, sites.molecule) for frame in frames.positions])
+    fractions = np.linalg.solve(np.swapaxes(frames.cells, 1, 2), np.swapaxes(centre, 1, 2))  # cells as columns
+    shift = np.swapaxes(np.swapaxes(frames.cells, 1, 2) @ np.floor(fractions), 1, 2)
+    return frames._replace(positions=frames.positions - shift[:, sites.molecule].astype(np.float32))
+
+
+def _check_shapes(path: Path, sites: Sites, frame: np.ndarray) -> None:
+    """Raise OutputError if distances within molecules are not as in the molecules of this run."""
+    pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
+    wanted, seen = (np.linalg.norm(at[pairs + 1] - at[pairs], axis=1) for at in (sites.offset_body, frame))
+    if np.abs(wanted - seen).max(initial=0.0) > MAX_DEVIATION:
+        raise OutputError(f"{path} is not the trajectory of this run: its molecules have other shapes")
+
+
+def _centres(frame: np.ndarray, molecule: np.ndarray) -> np.ndarray:
+    count = np.bincount(molecule)
+    return np.stack([np.bincount(molecule, frame[:, k]) / count for k in range(3)], axis=-1)
+
+
+def describe_thinning(frames: Frames) -> list[str]:
+    """Notes on the frames of a trajectory that are left out."""
+    notes = []
+    if frames.stride > 1:
+        notes.append(
+            f"{len(frames.time)} of {frames.count} frames are shown, every {frames.stride}th: "
+            "all of them would be too large."
+        )
+    if frames.is_cut:
+        notes.append("The trajectory ends within a frame, which is left out.")
+    return notes
+
+
+def massive_bonds(system: System) -> list[list[int]]:
+    """Bonds for chemiscope, [i, j, 1], in indices of the sites with mass."""
+    massive = np.flatnonzero(system.sites.mass > 0)
+    number = np.full(len(system.sites.mass), -1)
+    number[massive] = np.arange(len(massive))
+    return [[int(i), int(j), 1] for i, j in number[connections(system)]]
+
+
+def page_part(record: Record) -> tuple[list[str], list[str]]:
+    """The animation as HTML, and notes on data left out. Raises OutputError."""
+    code = chemiscope_script()
+    sites = record.molecules.sites
+    massive = np.flatnonzero(sites.mass > 0)
+    frames = frames_of(record, max(2, MOST_COORDINATES // (3 * len(massive))))
+    notes = describe_thinning(frames)
+    positions = frames.positions[:, massive]
+    if len(massive) < len(sites.mass):
+        notes.append("Sites without mass are not drawn.")
+    low, high = positions.min(), positions.max()
+    scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
+    data = {
+        "time": packed(frames.time, "<f8"),
+        "positions": packed(np.round((positions - low) / scale - LARGEST_INTEGER), "<i2"),
+        "low": float(low),
+        "scale": scale,
+        "steps": LARGEST_INTEGER,
+        "elements": [str(element) for element in sites.element[massive]],
+        "bonds": massive_bonds(record.molecules),
+        "cells": None if frames.cells is None else packed(frames.cells.reshape(-1, 9), "<f4"),
+        "name": record.scene.name,
+    }
+    count = np.bincount(record.molecules.model.species, minlength=len(record.molecules.species))
+    legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, record.molecules.species, strict=True))
+    how = (
+        "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes. "
+        "Space plays. A click on a plot jumps to its time. Drawn by chemiscope (chemiscope.org)."
+    )
+    beneath = f'<p class="legend">{html.escape(legend)}</p><p class="faint noprint">{how}</p>'
+    picture = '<div class="molecules" id="film-picture"></div><div hidden id="film-meta"></div>'
+    picture += '<div hidden id="film-info"></div>'
+    parts = [stage(picture, beneath, record, notes), data_part(data), script(code)]
+    return [*parts, script(read_asset("film.js")), script(read_asset("molecules.js"))], notes
+
+
+#: Direction of the eye.
+EYE = np.array([0.45, -1.0, 0.33])
+#: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
+SPHERE_SCALE, DEFAULT_RADIUS = 1.15, 1.2
+#: Discs of a lit sphere from its rim on: radius, shift towards the light (both in radii), amount of white.
+DISCS = ((1.0, 0.0, -0.35), (0.93, 0.03, 0.0), (0.62, 0.2, 0.12), (0.3, 0.34, 0.45))
+LIGHT = np.array([-0.61, 0.79])
+#: Fraction of white in the atoms that are furthest away.
+HAZE = 0.5
+
+
+class MoleculeDrawing:
+    """Draws molecules at the times of an animation: lit spheres in the box, distant ones paler, and a scale."""
+
+    def __init__(self, record: Record, frames: Frames):
+        from matplotlib.colors import to_rgb
+
+        sites = record.molecules.sites
+        self._shown = np.flatnonzero(sites.mass > 0)
+        elements = sites.element[self._shown]
+        self._radius = np.array([SPHERE_SCALE * COVALENT[e] if e in COVALENT else DEFAULT_RADIUS for e in elements])
+        self._color = np.array([to_rgb(COLOURS.get(e, OTHER)) for e in elements])
+        self._frames, self._view = frames, camera(EYE, np.array([0.0, 0.0, 1.0]))
+        self._low, self._high = self._limits()
+
+    def draw(self, axes, time: float) -> None:
+        """Draw the last frame up to a time into axes, which are cleared."""
+        from matplotlib.collections import EllipseCollection
+
+        frames = self._frames
+        k = max(0, int(np.searchsorted(frames.time, time + 1e-9 * (frames.time[-1] - frames.time[0]), "right")) - 1)
+        axes.clear()
+        axes.set_axis_off()
+        axes.set(xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]), aspect="equal")
+        seen = frames.positions[k, self._shown] @ self._view.T  # right, up, towards the eye
+        order = seen[:, 2].argsort()
+        near = (seen[order, 2] - self._low[2]) / (self._high[2] - self._low[2])
+        haze = (HAZE * (1 - near.clip(0, 1)))[:, None]
+        color, radius = self._color[order], self._radius[order]
+        discs = []
+        for size, lift, white in DISCS:
+            tint = color * (1 + min(white, 0)) + (1 - color) * max(white, 0)
+            discs.append(
+                (seen[order, :2] + lift * radius[:, None] * LIGHT, 2 * size * radius, tint * (1 - haze) + haze)
+            )
+        positions, widths, colors = (np.stack(part, axis=1) for part in zip(*discs, strict=True))
+        widths = widths.ravel()
+        self._box(axes, k, back=True)
+        axes.add_collection(
+            EllipseCollection(
+                widths, widths, 0, units="xy", offsets=positions.reshape(-1, 2), offset_transform=axes.transData,
+                facecolors=colors.reshape(-1, 3).clip(0, 1), edgecolors="none", zorder=2,
+            )
+        )  # fmt: skip
+        self._box(axes, k, back=False)
+        self._scale(axes)
+
+    def _corners(self, k: int) -> np.ndarray:
+        cells = self._frames.cells
+        return (
+            np.zeros((0, 3)) if cells is None else np.array(list(product((0, 1), repeat=3))) @ cells[k] @ self._view.T
+        )
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest coordinates in the picture, which is square, and in depth."""
+        frames = range(len(self._frames.time))
+        positions = [self._corners(k) for k in frames] if self._frames.cells is not None else self._frames.positions
+        positions = np.concatenate([part if part.shape[0] == 8 else part @ self._view.T for part in positions])
+        low, high = positions.min(0), positions.max(0)
+        middle, half = (low + high) / 2, (high - low) / 2
+        half[:2] = half[:2].max()
+        half = 1.08 * half + 1.0
+        return middle - half, middle + half
+
+    def _box(self, axes, k: int, back: bool) -> None:
+        """The edges of the box at its furthest corner (`back`), or all others."""
+        corners = self._corners(k)
+        if not len(corners):
+            return
+        furthest = int(corners[:, 2].argmin())
+        for i, j in combinations(range(8), 2):
+            if (i ^ j) in (1, 2, 4) and (furthest in (i, j)) == back:
+                axes.plot(*corners[[i, j], :2].T, color=FAINT if back else INK, lw=0.8, zorder=1 if back else 3)
+
+    def _scale(self, axes) -> None:
+        """A round length at the lower right."""
+        span = self._high[0] - self._low[0]
+        length = next(x for x in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if x < 0.3 * span or x == 1)
+        right, foot = self._high[0] - 0.03 * span, self._low[1] + 0.03 * span
+        axes.plot([right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4)
+        axes.text(right, foot + 0.012 * span, f"{length} Å", color=INK, fontsize=10, ha="right", va="bottom", zorder=4)
