@@ -23,7 +23,7 @@ FEMTOSECOND = 1e-3  # ps
 BAR = 1e5 * AVOGADRO * 1e-30 * 1e-3 * KJ_PER_MOL  # u/(Å ps²)
 GRAM_PER_CM3 = AVOGADRO * 1e-24  # u/Å³
 
-#: What `rigidmd energy --unit` offers: name -> size in u Å²/ps².
+#: Units of `rigidmd energy --unit`: name -> size in u Å²/ps².
 ENERGY_UNITS = {
     "kJ/mol": KJ_PER_MOL,
     "kcal/mol": 4.184 * KJ_PER_MOL,

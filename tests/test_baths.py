@@ -52,7 +52,9 @@ def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
     system = build(small_scene(MIXTURE, 150.0, start={"temperature_K": 30.0}))
     state, engine = system.state.copy(), Engine(system.model, {})
     before, *_ = kinetic(system, state)
-    move(engine, state, BAOAB.with_rotor("exact").with_thermostat(bath), 0.05, 60)  # the split rotor has an error of its own
+    move(
+        engine, state, BAOAB.with_rotor("exact").with_thermostat(bath), 0.05, 60
+    )  # the split rotor has an error of its own
     after, moving, turning = kinetic(system, state)
     assert after - before == pytest.approx(state.energy_ledger[HEAT], rel=1e-11)
     kind = np.array([m.name for m in system.species])[system.model.species]
@@ -66,7 +68,7 @@ def test_free_bodies_of_every_kind_come_to_their_distribution(bath):
     assert (np.isnan(turning[kind == "nitrogen"]).sum(axis=1) == 1).all()
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def stir(model, state, keep, keep_turning, new, numbers, first, end):
     return apply_langevin_group(model, state, keep, keep_turning, new, numbers, first, end)
 
@@ -115,7 +117,13 @@ def liquid():
     system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
         "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
     remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
-    move(engine, state, BAOAB.with_thermostat(Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))), 0.001, 500)
+    move(
+        engine,
+        state,
+        BAOAB.with_thermostat(Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))),
+        0.001,
+        500,
+    )
     return system, state._replace(energy_ledger=np.zeros(3))
 
 

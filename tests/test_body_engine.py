@@ -27,13 +27,13 @@ from support import (
     split_rotor,
     state_of,
 )
-from support import integrate_function as integral
-from support import is_constant_function as is_steady
 from support import constant_function as steady
+from support import integrate_function as integral
 from support import interpolated_function as table
+from support import is_constant_function as is_steady
+from support import pulse_function as window
 from support import sum_functions as total
 from support import values_at as value_at
-from support import pulse_function as window
 
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation

@@ -165,7 +165,9 @@ def test_sums_are_those_of_numpy(molecules):
     assert found.torque == pytest.approx((inverse * load.torque_body**2).sum(), rel=1e-12)
     if len(state.rotation):
         state.rotation[1] += 1e-6
-    assert sums_of_state(model, state).orthogonality_error == pytest.approx(orthogonality_error(state.rotation), abs=1e-15)
+    assert sums_of_state(model, state).orthogonality_error == pytest.approx(
+        orthogonality_error(state.rotation), abs=1e-15
+    )
     assert sums_of_state(model, state)[2:4] == (0, 0)
     if len(state.rotation):
         state.rotation[0, 1, 1] = np.nan

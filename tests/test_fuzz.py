@@ -21,7 +21,7 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenes import FROM_FILE, SATELLITE, STRUCTURES
-from support import Checkpoint, Saved, read_checkpoint, state_of, write_checkpoint, write_state
+from support import Checkpoint, SavedState, read_checkpoint, state_of, write_checkpoint, write_state
 
 from rigidmd.commands.cli import main
 from rigidmd.errors import UNPRINTABLE, CheckpointError
@@ -434,7 +434,7 @@ def _states(attack, folder, told):
     arrays, changes = told
     turn = np.tile(np.eye(3), (2, 1, 1))
     state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, 18.0 * np.eye(3))
-    write_state(folder / "good.npz", Saved(state, ["spce"], np.zeros(2, int), np.array([1, 2])))
+    write_state(folder / "good.npz", SavedState(state, ["spce"], np.zeros(2, int), np.array([1, 2])))
     with np.load(folder / "good.npz") as good:
         found = {name: good[name] for name in good.files}
     for name, array in arrays.items():

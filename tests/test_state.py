@@ -36,7 +36,9 @@ def same_bits(a, b):
 
 def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
     system, engine, state = built({"spce": 5, "argon": 2}, 20.0, 1)
-    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT)))
+    row = VERLET.with_thermostat(
+        VelocityRescaling(constant_ramp(BOLTZMANN * 300), 0.1, system.freedom.total, key_of(1, THERMOSTAT))
+    )
     move(engine, state, row, 0.001, 7)
     assert state.energy_ledger[HEAT] != 0
     write_state(tmp_path / "s.npz", system.saved(state))
@@ -50,7 +52,9 @@ def test_a_state_comes_back_from_disk_to_the_bit(tmp_path):
 def test_another_engine_goes_on_where_the_state_is(tmp_path, steps):
     """Time, heat and random numbers go on from the state alone; points, whose sums have one order, to the bit."""
     system, _, start = built({"argon": 2}, 30.0, 2)
-    row = VERLET.with_thermostat(VelocityRescaling(constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT)))
+    row = VERLET.with_thermostat(
+        VelocityRescaling(constant_ramp(BOLTZMANN * 100), 0.05, system.freedom.total, key_of(1, THERMOSTAT))
+    )
     whole = start.copy()
     move(system.engine(), whole, row, 0.003, 20)
     state = start

@@ -11,7 +11,7 @@ import zipfile
 import numpy as np
 import pytest
 from scenes import FROM_FILE, GOOD, SATELLITE, STRUCTURES
-from support import COLUMNS, Sample, Samples, Saved, build, line_of, memory, read_molecule, state_of, write_state
+from support import COLUMNS, Sample, Samples, SavedState, build, line_of, memory, read_molecule, state_of, write_state
 from support import memory_room as room
 from support import wave_vectors as vectors
 
@@ -184,7 +184,7 @@ def test_a_structure_that_was_made_to_break(name, old, new, expected, capsys, tm
 def test_a_state_with_a_cell_that_is_none(cell, tmp_path):
     turn = np.tile(np.eye(3), (2, 1, 1))
     state = state_of(np.array([[0.0, 0, 0], [5, 5, 5]]), None, turn, None, cell)
-    write_state(tmp_path / "final.npz", Saved(state, ["spce"], np.zeros(2, int), None))
+    write_state(tmp_path / "final.npz", SavedState(state, ["spce"], np.zeros(2, int), None))
     (tmp_path / "scene.toml").write_text(FROM_FILE.replace("FILE", "final.npz").replace("lengths_A = 18.0", ""))
     with pytest.raises(StructureError, match="cell: damaged"):
         build(Scene.read(tmp_path / "scene.toml"))

@@ -17,7 +17,7 @@ LARGEST = 1e30  # largest magnitude of any number in a state
 NOT_A_ROTATION = 1e-6  # largest |Q^T Q - 1| of a state that is read; runs end near 1e-13
 
 
-class Saved(NamedTuple):
+class SavedState(NamedTuple):
     """The content of a file."""
 
     state: State
@@ -28,7 +28,7 @@ class Saved(NamedTuple):
     models: np.ndarray | None = None
 
 
-def write_state(path: Path, saved: Saved) -> None:
+def write_state(path: Path, saved: SavedState) -> None:
     """Write a state of molecules, without pickle. Raises OutputError."""
     more = {"residue_number": saved.residue_number, "models": saved.models}
     more = {name: array for name, array in more.items() if array is not None}
@@ -38,7 +38,7 @@ def write_state(path: Path, saved: Saved) -> None:
         np.savez(temporary, schema=SCHEMA, species_names=names, species=saved.species, **more, **arrays)
 
 
-def read_state(path: Path) -> Saved:
+def read_state(path: Path) -> SavedState:
     """Read a state, to the bit. Raises StructureError with all errors found in the file."""
     if reason := unreadable_reason(path):
         raise StructureError(str(path), [reason])
@@ -69,7 +69,7 @@ def read_state(path: Path) -> Saved:
     state = State(
         *(np.asarray(arrays[k], like.dtype, order="C") for k, like in zip(STORED_NAMES, example, strict=True))
     )
-    return Saved(state, names, species, arrays.get("residue_number"), arrays.get("models"))
+    return SavedState(state, names, species, arrays.get("residue_number"), arrays.get("models"))
 
 
 def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:

@@ -16,7 +16,7 @@ BATCHES, BATCH_FACTOR = 5, 1.5
 LOST_FREEDOM = 2.5
 
 
-def mean(values: ArrayLike) -> tuple[float | None, float | None]:
+def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
     """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN.
 
     The error accounts for correlation; it is None if the samples are too few, or all of them correlated. It is the

@@ -133,11 +133,9 @@ def energies(system: BodySystem, times: np.ndarray, states: State) -> dict[str, 
         if isinstance(term, SteadyForce):
             potential += steady_energies(term, states.position, states.rotation)
     return {
-        "kinetic": kinetic,
-        "potential": potential,
-        "energy": kinetic + potential,
+        "kinetic": kinetic, "potential": potential, "energy": kinetic + potential,
         "work": states.energy_ledger.reshape(n, 3)[:, WORK],
-    }
+    }  # fmt: skip
 
 
 def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

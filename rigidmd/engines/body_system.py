@@ -16,7 +16,7 @@ from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.neighbors.space import Unbounded
 from rigidmd.mechanics.free_rotor import DrivenRotor
-from rigidmd.mechanics.inertia import Kind, kind_of_body
+from rigidmd.mechanics.inertia import BodyKind, kind_of_body
 from rigidmd.mechanics.time_functions import TimeFunction, piece_at, values_at
 from rigidmd.mechanics.translation import FluidTranslation
 from rigidmd.scene import BodyScene
@@ -86,13 +86,12 @@ class BodySystem:
         return len(self.state.position) > 0
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> BodyKind:
         """Kind of body, about the pivot or the centre of mass."""
         return kind_of_body(self.inertia)
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Translational (none if pinned) and rotational degrees of freedom."""
         return 3 * self.translates + int((self.inertia > 0).sum())
 
     @property
@@ -200,7 +199,6 @@ class BodySystem:
 
     @property
     def sites(self) -> Sites:
-        """The points as the sites of one molecule."""
         n = len(self.points)
         names = np.array(self.point_names, dtype=object)
         return Sites(np.zeros(n, int), self.points, names, np.full(n, "X", dtype=object), np.full(n, self.mass / n))

@@ -190,7 +190,6 @@ class Engine:
         return row.thermostat or NoThermostat(), row.barostat or NoBarostat(), flow_arrays(row), probe, self._heat, box
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
-        """The dispatcher of all terms for `use` (steps or observations), which writes to a separate load."""
         if use not in self._dispatchers:
             self._dispatchers[use] = TermDispatcher(
                 workspaces, isinstance(self.model, Model), self._setup.with_energies
@@ -260,7 +259,10 @@ class Engine:
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
-        kept = {name: {key: memory[f"{name}.{key}"] for key in of} for name, of in _by_owner(memory).items()}
+        kept: dict[str, dict[str, np.ndarray]] = {}
+        for name, array in memory.items():
+            owner, _, key = name.rpartition(".")
+            kept.setdefault(owner, {})[key] = array
         if unknown := kept.keys() - {*self.names, *MEMORY_FIELDS}:
             raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
         self._recall_lists(state, kept)
@@ -374,15 +376,6 @@ def keep_time(state: State, dt: float) -> None:
         state.begin_segment()
 
 
-def _by_owner(memory: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """Owner -> names of its arrays, from names of the form owner.array."""
-    found: dict[str, list[str]] = {}
-    for name in memory:
-        owner, _, key = name.rpartition(".")
-        found.setdefault(owner, []).append(key)
-    return found
-
-
 def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
     """Copy kept arrays into the arrays of a tuple. Raises ValueError if they do not fit."""
     for name, array in kept.items():
@@ -395,7 +388,6 @@ def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
 
 
 def _check_arrays(state: State) -> None:
-    """Raise TypeError if an array of a state has another type than the compiled code expects."""
     for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
         if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
             raise TypeError(
@@ -422,8 +414,6 @@ class NotFiniteError(SimulationError):
 
 
 class BehindWallError(SimulationError):
-    """A site is behind a wall that it cannot pass."""
-
     def __init__(self, behind: SiteBehindWall):
         self.molecule = behind.molecule
         self.reason = str(behind)

@@ -24,18 +24,18 @@ from rigidmd.forces.body.resistance import add_resistance
 from rigidmd.forces.terms import compute_body_load, total_power
 from rigidmd.mechanics.free_rotor import moment_rates
 from rigidmd.mechanics.odes import (
+    AttitudeForm,
     EulerAngles,
-    Form,
     Matrix,
     NoAttitude,
     Quaternion,
     attitude_rates,
-    read_attitude,
-    variables_of,
+    attitude_variables,
+    write_rotation,
 )
 from rigidmd.mechanics.translation import body_component, inertial_mass
 
-FORMS: dict[str, Form] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
+FORMS: dict[str, AttitudeForm] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
 #: A step of DOP853 is at the limit of stability if step times eigenvalue is above STABLE. STIFF such steps show a stiff
 #: problem, MILD other steps in a row restart the count. Relative changes below ROUNDED within a step are rounding.
@@ -58,7 +58,7 @@ def read(form, model, state, time, y):
     """Write the solver's variables into a state."""
     n = form.variables
     state.time[NOW] = time
-    read_attitude(form, y, state.rotation)
+    write_rotation(form, y, state.rotation)
     for m in range(len(state.angular_momentum_body)):
         for k in range(3):
             inertia, _, carried, _ = moment_rates(model.rotor, time, k)
@@ -176,7 +176,7 @@ class OdeEngine(Engine):
                 omega.append((state.angular_momentum_body[0, k] - carried) / inertia if inertia > 0 else 0.0)
         translation = [state.position.ravel(), state.velocity.ravel()]
         y = np.concatenate(
-            [variables_of(_form(solver, state), state.rotation), omega, *translation, state.energy_ledger[[WORK]]]
+            [attitude_variables(_form(solver, state), state.rotation), omega, *translation, state.energy_ledger[[WORK]]]
         )
         if solver.name != RK4:
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._scales(solver, state, y)])
@@ -231,7 +231,7 @@ class OdeEngine(Engine):
         self._solver = self._dense_output = None
         self._restart = True
 
-    def _rk4(self, form: Form, state: State, dt: float, until: int) -> None:
+    def _rk4(self, form: AttitudeForm, state: State, dt: float, until: int) -> None:
         y = state.extra_variables
         cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
         while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
@@ -240,7 +240,7 @@ class OdeEngine(Engine):
             self._handle_status(status, state)
         read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
-    def _adaptive(self, form: Form, state: State, solver: Solver, dt: float, until: int) -> None:
+    def _adaptive(self, form: AttitudeForm, state: State, solver: Solver, dt: float, until: int) -> None:
         variables = len(state.extra_variables) // 3
         begun, y_begin, y, scales = np.split(state.extra_variables, [2, 2 + variables, 2 + 2 * variables])
         end = state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt
@@ -293,7 +293,7 @@ class OdeEngine(Engine):
             self._other_steps += 1
             self._stiff_steps *= self._other_steps < MILD
 
-    def _new_solver(self, form: Form, state: State, solver: Solver, begun, y_begin, scales) -> Dop853 | Radau:
+    def _new_solver(self, form: AttitudeForm, state: State, solver: Solver, begun, y_begin, scales) -> Dop853 | Radau:
         """SciPy's solver at the begin of one of its steps. It chooses the length of an unknown step."""
         dy = np.zeros(len(y_begin))
 
@@ -331,13 +331,11 @@ def _as_solver(row: Scheme | Solver) -> Solver:
     return row
 
 
-def _form(solver: Solver, state: State) -> Form:
+def _form(solver: Solver, state: State) -> AttitudeForm:
     return FORMS[solver.formulation] if len(state.rotation) else NoAttitude()
 
 
 class SingularError(SimulationError):
-    """Singular Euler angles."""
-
     def __init__(self, theta: float, time: float):
         where = "0" if np.cos(theta) > 0 else "pi"
         super().__init__(

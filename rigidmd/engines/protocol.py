@@ -32,7 +32,7 @@ class Engine(Protocol):
 
     def begin(self, state: State, row: Scheme | Solver) -> State:
         """A copy of a state with the variables of an integrator."""
-        ...
+        return state.copy()._replace(extra_variables=self.variables(state, row))
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         """Move the state in place, in steps of dt, until its step counter is `until`. Raises SimulationError.
@@ -47,7 +47,7 @@ class Engine(Protocol):
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
         """`evaluate` at the state that was just moved, with what its last step has already computed."""
-        ...
+        return self.evaluate(state)
 
     def snapshot(self) -> State:
         """An exact copy of the state that was last moved."""

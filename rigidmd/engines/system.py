@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.core.state_file import Saved
+from rigidmd.core.state_file import SavedState
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import DegreesOfFreedom, mobile
 from rigidmd.engines.cpu import Engine, Precision
@@ -65,12 +65,10 @@ class System:
         """All sites. Made at the first use, because a run needs them only to write a trajectory."""
         owner = np.repeat(np.arange(len(self.model.species)), self.sites_per_molecule)
         return Sites(
-            owner,
-            self.of_sites(lambda m: m.positions_body),
+            owner, self.of_sites(lambda m: m.positions_body),
             self.of_sites(lambda m: np.array(m.site_names, dtype=object)),
-            self.of_sites(lambda m: np.array(m.elements, dtype=object)),
-            self.of_sites(lambda m: m.masses),
-        )
+            self.of_sites(lambda m: np.array(m.elements, dtype=object)), self.of_sites(lambda m: m.masses),
+        )  # fmt: skip
 
     @property
     def site_count(self) -> int:
@@ -136,12 +134,12 @@ class System:
         sigma = [s for m in self.species for s, e in zip(m.sigma, m.epsilon, strict=True) if e > 0]
         return min(sigma or [m.radius for m in self.species if m.radius > 0] or [1.0])
 
-    def saved(self, state: State) -> Saved:
+    def saved(self, state: State) -> SavedState:
         """A state as its file holds it, with names and numbers. Frozen and free molecules are one species there."""
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
         first = [next(m for m in self.species if m.name == name) for name in names]
-        return Saved(
+        return SavedState(
             state, names, index[self.model.species], self.residue_number, np.array([m.fingerprint for m in first])
         )
 
@@ -151,7 +149,6 @@ class System:
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
 
     def engine(self) -> Engine:
-        """A new engine for this system, in the precision of the scene."""
         return self.engine_of(self.terms, self.scene.precision)
 
     def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:

@@ -62,7 +62,6 @@ def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> Non
 
 
 def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
-    """List the files that may be removed from a folder with --force. Raises OutputError."""
     write_text(folder / marker, "\n".join(dict.fromkeys(names)) + "\n")
 
 

@@ -21,7 +21,6 @@ def input_names(scene: Scene) -> dict[str, str]:
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write a resolved scene and copies of its input files."""
     data = scene.model_dump(exclude_none=True)
     for key, copied in input_names(scene).items():
         with atomic_file(folder / copied) as temporary:

@@ -61,7 +61,6 @@ def write_columns(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 
 def write_npz(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Write columns as arrays by name."""
     with atomic_file(path) as temporary:
         np.savez(temporary, **columns)  # pyright: ignore[reportArgumentType]  (no column is called allow_pickle)
 

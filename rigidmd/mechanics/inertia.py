@@ -4,7 +4,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-Kind = Literal["point", "linear", "spherical", "symmetric", "asymmetric"]
+BodyKind = Literal["point", "linear", "spherical", "symmetric", "asymmetric"]
 
 #: Two principal moments that differ by less than this fraction of the largest count as equal, and a smaller moment as
 #: zero. 1e-8 in inertia is 1e-4 in length: a bend of 0.0001 Å on a bond of 1 Å is a rounded coordinate, and at 300 K
@@ -23,7 +23,7 @@ class PrincipalFrame(NamedTuple):
     centre: np.ndarray
     axes: np.ndarray
     inertia: np.ndarray
-    kind: Kind
+    kind: BodyKind
 
 
 def inertia_tensor(masses: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def principal_frame(masses: np.ndarray, positions: np.ndarray, size: float | Non
     return PrincipalFrame(mass, centre, axes, moments, kind)
 
 
-def kind_of_body(inertia: np.ndarray) -> Kind:
+def kind_of_body(inertia: np.ndarray) -> BodyKind:
     """Kind of body from three principal moments in any order."""
     low, middle, high = np.sort(inertia)
     if high == 0:
@@ -99,6 +99,6 @@ def kind_of_body(inertia: np.ndarray) -> Kind:
     return "asymmetric"
 
 
-def rotational_freedom(kind: Kind) -> int:
+def rotational_freedom(kind: BodyKind) -> int:
     """Rotational degrees of freedom: 0 for a point, 2 for a linear body, otherwise 3."""
     return {"point": 0, "linear": 2}.get(kind, 3)

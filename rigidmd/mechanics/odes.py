@@ -37,36 +37,36 @@ class NoAttitude(NamedTuple):
     variables: int = 0
 
 
-Form = Matrix | Quaternion | EulerAngles | NoAttitude
+AttitudeForm = Matrix | Quaternion | EulerAngles | NoAttitude
 
 
-def variables_of(form: Form, rotation: np.ndarray) -> np.ndarray:
+def attitude_variables(form: AttitudeForm, rotation: np.ndarray) -> np.ndarray:
     """The attitude variables of a rotation matrix (1, 3, 3)."""
     if isinstance(form, NoAttitude):
         return np.zeros(0)
     return {Matrix: np.ravel, Quaternion: to_quaternion, EulerAngles: to_euler_angles}[type(form)](rotation[0])
 
 
-def read_attitude(form, y, rotation):
+def write_rotation(form, y, rotation):
     """Write Q (1, 3, 3) from the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
     raise TypeError("compiled code only")
 
 
-@implements(read_attitude, inline=True)
-def _read_attitude(form, y, rotation):
+@implements(write_rotation, inline=True)
+def _write_rotation(form, y, rotation):
     if is_a(form, NoAttitude):
         return lambda form, y, rotation: None
     if is_a(form, Matrix):
 
-        def read_matrix(form, y, rotation):
+        def from_matrix(form, y, rotation):
             for i in range(3):
                 for j in range(3):
                     rotation[0, i, j] = y[3 * i + j]
 
-        return read_matrix
+        return from_matrix
     if is_a(form, Quaternion):
 
-        def read_quaternion(form, y, rotation):
+        def from_quaternion(form, y, rotation):
             q = rotation[0]
             w, a, b, c = y[0], y[1], y[2], y[3]
             q[0, 0] = w * w + a * a - b * b - c * c
@@ -79,9 +79,9 @@ def _read_attitude(form, y, rotation):
             q[1, 2] = 2 * (b * c - w * a)
             q[2, 1] = 2 * (b * c + w * a)
 
-        return read_quaternion
+        return from_quaternion
 
-    def read_euler(form, y, rotation):
+    def from_euler_angles(form, y, rotation):
         q = rotation[0]
         c1, s1 = cos(y[0]), sin(y[0])
         c2, s2 = cos(y[1]), sin(y[1])
@@ -96,7 +96,7 @@ def _read_attitude(form, y, rotation):
         q[2, 1] = s2 * c3
         q[2, 2] = c2
 
-    return read_euler
+    return from_euler_angles
 
 
 def attitude_rates(form, y, w0, w1, w2, rates):

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from rigidmd.core.toml import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
-from rigidmd.mechanics.inertia import Kind, principal_frame, rotational_freedom
+from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
 from rigidmd.scene.validation import (
     Line,
     NonNegative,
@@ -138,7 +138,7 @@ class Molecule:
     epsilon: np.ndarray
     mass: float
     inertia: np.ndarray
-    kind: Kind
+    kind: BodyKind
     group: str = "other"
     note: str = ""
     mixing: Mixing | None = None

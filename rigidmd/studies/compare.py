@@ -28,8 +28,6 @@ BITS = 53
 
 
 class CellDifference(NamedTuple):
-    """Two values of a column that are not the same."""
-
     column: str
     first: str
     second: str
@@ -148,7 +146,6 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
 
 
 def _same_times(first: dict[str, list[str]], second: dict[str, list[str]], time: str) -> bool:
-    """Whether the same steps have the same times."""
     times = dict(zip(second[STEP], second[time], strict=True))
     return all(times.get(step, value) == value for step, value in zip(first[STEP], first[time], strict=True))
 

@@ -24,7 +24,7 @@ def couple(bath, model, state, h, draw):
     calmer = 1 + h * bath.rate * (0.5 * bath.freedom_rotation * bath.thermal_energy / turning - 1)
     scale_array(state.velocity, sqrt(slower))
     scale_array(state.angular_momentum_body, sqrt(calmer))
-    state.books[0] += (slower - 1) * moving + (calmer - 1) * turning  # energy less heat is conserved
+    state.energy_ledger[0] += (slower - 1) * moving + (calmer - 1) * turning  # energy less heat is conserved
 
 
 stage = {"ensemble": "nvt", "temperature_K": 330, "duration_ps": 2, "integrator": "baoab"}  # its row has a middle

@@ -127,15 +127,11 @@ class LammpsEngine(ExternalEngine):
         energies = [f"compute e{n} all pair {files.style_name(self._styles, n)}" for n in range(len(self._styles))]
         columns = " ".join(f"c_{line.split()[1]}" for line in energies)
         self._process.run_commands(
-            "clear",
-            *files.settings(view),
-            f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}",
-            *energies,
+            "clear", *files.settings(view), f"reset_timestep {state.step[NOW] - state.step[ORIGIN]}", *energies,
             "compute virial all pressure NULL pair kspace",
-            f"thermo_style custom step pe {'elong' if view.has_ewald_sum else ''} {columns} c_virial[*]",
-            *self._fixes,
+            f"thermo_style custom step pe {'elong' if view.has_ewald_sum else ''} {columns} c_virial[*]", *self._fixes,
             "run 0",
-        )
+        )  # fmt: skip
         self._heat_offset = 0.0
         given = state.copy()
         self._receive(given)

@@ -58,7 +58,6 @@ class Particles(NamedTuple):
         return order[(self.owner[order] != order) | (size[order] == 1)]
 
     def rotation(self) -> np.ndarray:
-        """Q of each molecule (n, 3, 3)."""
         return from_quaternion(self.orientation[self.centres])
 
     def site_velocities(self) -> np.ndarray | None:
@@ -198,8 +197,6 @@ MOMENTA = {"velocity": np.float32, "angmom": np.float32}
 
 
 class GsdFile(FrameFile):
-    """Writes GSD files."""
-
     def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
         super().__init__(path, system, velocities, wrapped, kept)
         self._changing = POSITIONS | MOMENTA if velocities else POSITIONS
@@ -337,7 +334,6 @@ def _open(path: Path, mode: Any) -> Any:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Within it, errors of the library become OutputError."""
     try:
         yield
     except (OSError, RuntimeError) as error:

@@ -77,7 +77,6 @@ class TrajReader:
         self._file.close()
 
     def read(self, k: int) -> Stored:
-        """Frame k."""
         try:
             item = self._file[k]
             atoms, others = (len(self._atoms), 3), (self.sites - len(self._atoms), 3)

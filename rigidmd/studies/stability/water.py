@@ -93,7 +93,6 @@ def tip4p_steps(result: CaseResult, quick: bool) -> None:
 
 
 def run_nve(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
-    """The outcome of an NVE run of water from a state."""
     return run_molecules(water_scene(model, step, steps, family, 0.0), state, scale=scale)
 
 

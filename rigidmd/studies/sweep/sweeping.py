@@ -41,8 +41,6 @@ def cores() -> int:
 
 
 class SweepRequest(NamedTuple):
-    """What the user asks for."""
-
     path: Path  # of the scene file
     axes: list[Axis]
     folder: Path | None = None  # default: runs/NAME-sweep

@@ -183,7 +183,6 @@ def _summarise_motion(record: Record) -> dict[str, Measured]:
 
 
 def table_text(table: Table) -> str:
-    """The main columns as text."""
     short = short_keys(table.keys)
     shown = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
     lines = [[*short.values(), "runs", *(SHORT.get(column, column) for column in shown)]]
