@@ -147,7 +147,7 @@ def _read_molecules(
             atoms = atoms._replace(position=atoms.position @ rotation.T, velocity=velocity)
             notes.append("its cell was rotated, contents included, so that a is along x and b in the xy plane")
         if orientation < 0:
-            notes.append("its cell is left-orientation: -c replaces c, which does not change the lattice")
+            notes.append("its cell is left-handed: -c replaces c, which does not change the lattice")
         if right_angled(cell):
             upright = np.diag(np.linalg.norm(cell, axis=1))
             if np.abs(upright - cell).max() > ROUNDING * cell.max():
