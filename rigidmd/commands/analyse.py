@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import Commands, add_command, time_ps
+from rigidmd.commands.arguments import Commands, add_command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def add(commands: Commands) -> None:
         help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)",
     )  # fmt: skip
     analyse.add_argument(
-        "--viscosity", type=_positive, metavar="VALUE",
+        "--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
         help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)",
     )  # fmt: skip
     analyse.add_argument(
@@ -37,16 +37,6 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     analyse.add_argument("--list", action=_List, nargs=0, help="list the analyses")
     analyse.set_defaults(scene="this run", writes=True)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1e12:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a viscosity above 0")
-    return value
 
 
 class _List(argparse.Action):

@@ -142,12 +142,10 @@ def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[
 
 
 def command_line() -> str:
-    """The command line of this process."""
     return shlex.join(["rigidmd", *sys.argv[1:]])
 
 
 def print_page(path: Path, notes: list[str]) -> None:
-    """Print where a page is, after notes about it."""
     for note in notes:
         print(note)
     print(f"{path}: {path.stat().st_size / 1e6:.2g} MB; open it in a browser: {shlex.quote(str(path.resolve()))}")

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 
 def announce(message: str) -> None:
-    """Announce work that takes a moment."""
     print(f"  {message} ...", file=sys.stderr, flush=True)
 
 

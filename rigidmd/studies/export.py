@@ -23,8 +23,6 @@ MARKER = ".rigidmd-export"
 
 
 class EngineWriter(NamedTuple):
-    """Writes scenes for an engine."""
-
     title: str  # name of the engine
     unsupported_features: Callable[[ForceFieldView], list[str]]
     write: Callable[[Path, ForceFieldView, State], list[str]]  # into a folder; returns the names of files
@@ -32,8 +30,6 @@ class EngineWriter(NamedTuple):
 
 
 class Exported(NamedTuple):
-    """What was written."""
-
     title: str  # name of the engine
     files: list[str]
     notes: list[str]

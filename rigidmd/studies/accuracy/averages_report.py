@@ -39,7 +39,6 @@ def csv_row(found: Averages, run: AverageRun) -> list:
 
 
 def brief_headers(found: Averages) -> list[str]:
-    """Column titles of the printed table."""
     titles = ["method", "step (fs)", "forces/ps", "s/ns"]
     return titles + [f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})" for q in found.quantities]
 
@@ -68,7 +67,6 @@ def bias_conclusions(found: Averages) -> list[str]:
 
 
 def describe_references(found: Averages) -> list[str]:
-    """Sentences: the reference of each bias."""
     lines = []
     for quantity in found.quantities:
         fit = found.fit(quantity)
@@ -115,7 +113,6 @@ def describe_failures(found: Averages) -> list[str]:
 
 
 def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
-    """All files; the paths written."""
     write_csv(folder / FILES[0], [csv_headers(found), *(csv_row(found, run) for run in found.runs)])
     write_json(folder / FILES[1], to_json(found, command), indent=2, allow_nan=False)
     title = f"{found.name}: bias of averages over {found.sampled:g} ps"

@@ -98,8 +98,6 @@ def _fit(points: Sequence[MeanAtStep], longest: float, exact: float | None) -> t
 
 @dataclass
 class AverageRun:
-    """One method at one time step."""
-
     integrator: str
     thermostat: str
     timestep: float  # fs
@@ -143,7 +141,6 @@ class Averages:
         return MeanAtStep(run.method, run.timestep, *run.averages[quantity.name])
 
     def fit(self, quantity: AveragedQuantity) -> BiasFit | None:
-        """The fit of a quantity; None if no run has it."""
         if quantity.name not in self._fits:
             points = self.points(quantity)
             if not points:

@@ -22,7 +22,6 @@ ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased"
 
 
 def trial_headers(found: IntegratorAccuracy) -> list[str]:
-    """Column titles of the table, units included."""
     s = found.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
     return [
@@ -153,7 +152,6 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
 
 
 def _describe_timings(found: IntegratorAccuracy) -> list[str]:
-    """The reliability of the run times."""
     timed = [trial for trial in found.trials if not trial.diverged]
     if not timed:
         return []
@@ -231,7 +229,6 @@ def cheapest(found: IntegratorAccuracy) -> list[Cheapest]:
 
 
 def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
-    """Sentences: the cheapest integrator for each accuracy, over the span that was run."""
     s, lines = found.trial_system, []
     per, unit = "ps" if s.time_unit == "fs" else "s", s.time_unit
     for c in cheapest(found):
@@ -252,7 +249,6 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
 
 
 def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> list[Path]:
-    """Write all files. Returns their paths."""
     write_csv(folder / FILES[0], [trial_headers(found), *(trial_row(found, trial) for trial in found.trials)])
     written: list[str] = list(FILES[:3])
     if sampled := [average_row(found, trial) for trial in found.trials if trial.averages]:

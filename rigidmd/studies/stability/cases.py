@@ -50,22 +50,22 @@ class StabilityCase(NamedTuple):
 CASES: dict[str, StabilityCase] = {}
 
 
-def register_case(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
+def register(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
     """Register a function as a case under its own name, with the first line of its docstring."""
 
-    def register(run: CaseFunction) -> CaseFunction:
+    def add(run: CaseFunction) -> CaseFunction:
         sentence = (run.__doc__ or "").strip().splitlines()[0].rstrip(".")
         CASES[run.__name__] = StabilityCase(run.__name__, group, sentence, run, (x, error, step))
         return run
 
-    return register
+    return add
 
 
 def families(quick: bool) -> tuple[str, ...]:
     return QUICK if quick else tuple(FAMILIES)
 
 
-def outcome_of(run: Callable[[], Outcome]) -> Outcome:
+def attempt(run: Callable[[], Outcome]) -> Outcome:
     """The outcome of a run. An error of rigidmd becomes its message, any other exception a crash."""
     began = clock.perf_counter()
     try:
@@ -97,7 +97,7 @@ def run_body(
         reported_error = max([*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0)
         return Outcome(float(error(results)), float(reported_error))
 
-    return outcome_of(run)
+    return attempt(run)
 
 
 def molecules_scene(
@@ -145,7 +145,7 @@ def run_molecules(
         reported_error = energy_error(results, scale)
         return Outcome(reported_error if error is None else float(error(results)), reported_error)
 
-    return outcome_of(run)
+    return attempt(run)
 
 
 def run_invalid(data: dict) -> Outcome:
@@ -155,4 +155,4 @@ def run_invalid(data: dict) -> Outcome:
         Simulation(Scene.from_dict(data)).run()
         return Outcome(nan, 0.0)
 
-    return outcome_of(run)
+    return attempt(run)

@@ -1,8 +1,10 @@
-"""Stability cases: molecules that collide, overlap or lack repulsion; the smallest boxes, distances and densities."""
+"""Stability cases: molecules that collide, overlap or lack repulsion; extreme boxes and densities; invalid input."""
 
+import copy
 import resource
 import tempfile
-from math import sqrt
+from collections.abc import Iterator
+from math import inf, nan, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +16,15 @@ from rigidmd.core.state_file import write_state
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.studies.stability.cases import (
+    EXACT,
     SPLIT,
+    attempt,
+    body_scene,
     energy_error,
     families,
     molecular_scene,
     molecules_scene,
-    outcome_of,
-    register_case,
+    register,
     run_invalid,
     run_molecules,
     simulate,
@@ -59,7 +63,7 @@ def pair_of(distance: float, speed: float, thickness: float = 0.5) -> tuple[list
     return species, state
 
 
-@register_case(7, x="temperature (K)", error="energy error over kinetic energy", step="fs")
+@register(7, x="temperature (K)", error="energy error over kinetic energy", step="fs")
 def head_on(result: CaseResult, quick: bool) -> None:
     """Head-on collisions of Lennard-Jones molecules at 1e2 to 1e6 K, with the step scaled to the speed."""
     for temperature in (1e2, 1e6) if quick else (1e2, 1e3, 1e4, 1e5, 1e6):
@@ -79,7 +83,7 @@ def head_on(result: CaseResult, quick: bool) -> None:
                 result.limits.append(longest_step(lambda h, f=family: at(h, f), step, f"{temperature:.0e} K", family))
 
 
-@register_case(7, x="distance over sigma", error="energy error over the energy of the start", step="fs")
+@register(7, x="distance over sigma", error="energy error over the energy of the start", step="fs")
 def overlaps(result: CaseResult, quick: bool) -> None:
     """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused, separated or computed correctly."""
     for ratio in (0.5, 0.1, 0.0):
@@ -110,7 +114,7 @@ def overlaps(result: CaseResult, quick: bool) -> None:
                 reported_error = energy_error(results, results["potential"][0])
                 return Outcome(reported_error, reported_error)
 
-            return outcome_of(run)
+            return attempt(run)
 
         result.add("let go at 0.5 sigma", at(0.005), 1e-2, family, 0.5, 0.005)
         result.limits.append(longest_step(at, 0.005, "let go at 0.5 sigma", family))
@@ -130,10 +134,10 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
         reported_error = energy_error(results)
         return Outcome(reported_error, reported_error)
 
-    return outcome_of(run)
+    return attempt(run)
 
 
-@register_case(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
+@register(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
 def bare_charges(result: CaseResult, quick: bool) -> None:
     """A charge without repulsion next to an opposite one: they collapse, and the run reports it."""
     ion = {"mass_u": 10.0, "sigma_A": SIGMA, "epsilon_K": EPSILON}
@@ -154,7 +158,7 @@ def bare_charges(result: CaseResult, quick: bool) -> None:
     result.add("a hydrogen on a charge site", from_file(data, state), 0.0, SPLIT, 0.0, 1.0, (REFUSED,))
 
 
-@register_case(1, x="height of the middle site (Å)", error="energy error over kinetic energy", step="fs")
+@register(1, x="height of the middle site (Å)", error="energy error over kinetic energy", step="fs")
 def near_linear_molecules(result: CaseResult, quick: bool) -> None:
     """Molecules bent by 0.5 Å to 1e-15 Å and exactly straight, at 300 K: right, or refused as hardly bent."""
     heights = [0.5, 1e-2, 1e-5, 0.0] if quick else [0.5] + [10.0**-k for k in range(1, 16)] + [0.0]
@@ -166,7 +170,7 @@ def near_linear_molecules(result: CaseResult, quick: bool) -> None:
             result.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), step, RIGHT_OR_REFUSED)
 
 
-@register_case(2, x="mass ratio", error="energy error over kinetic energy", step="fs")
+@register(2, x="mass ratio", error="energy error over kinetic energy", step="fs")
 def mass_ratio(result: CaseResult, quick: bool) -> None:
     """Two species whose masses differ by 1e6, at the step of the light one."""
     species = [bent(0.5, "light", 1.0) | {"count": 20}, bent(0.5, "heavy", 1e6) | {"count": 7}]
@@ -180,7 +184,7 @@ def mass_ratio(result: CaseResult, quick: bool) -> None:
             result.limits.append(longest_step(at, 0.5, "1e6", family))
 
 
-@register_case(10, error="energy error over kinetic energy", step="fs")
+@register(10, error="energy error over kinetic energy", step="fs")
 def tight_boxes(result: CaseResult, quick: bool) -> None:
     """Boxes of exactly twice the cutoff, barely larger or smaller; thin slabs; one molecule, two, one too long."""
     cutoff = 6.0
@@ -206,7 +210,7 @@ def tight_boxes(result: CaseResult, quick: bool) -> None:
     result.add("a molecule longer than half the box", outcome, 0.0, SPLIT, expected=(REFUSED,))
 
 
-@register_case(10, x="shift (Å)", error="energy and force against the unshifted, relative")
+@register(10, x="shift (Å)", error="energy and force against the unshifted, relative")
 def far_away(result: CaseResult, quick: bool) -> None:
     """Molecules on a face, and shifted by whole boxes of 1e3 to 1e300 Å: the same forces to rounding, or refused."""
     edge = 16.0  # a power of two, so that shifts by whole boxes are exact while digits last
@@ -227,14 +231,14 @@ def far_away(result: CaseResult, quick: bool) -> None:
         return Outcome(max(gap, np.abs(load_there.force - load.force).max() / force), 0.0)
 
     on_face = state.position - state.position[0]
-    result.add("one exactly on a face", outcome_of(lambda: moved(on_face)), 1e-10, x=1.0)
+    result.add("one exactly on a face", attempt(lambda: moved(on_face)), 1e-10, x=1.0)
     for shift in (1e3, 1e7, 1e12, 1e300) if quick else [10.0**k for k in (3, 5, 7, 9, 11, 13, 15, 18, 20, 100, 300)]:
         boxes = np.round(shift / edge) * edge
         away = np.where(np.arange(len(state.position))[:, None] % 2, boxes, 0.0)
         # positions have an error of eps times the distance; forces vary relatively by about ten per Å
         left = 1e3 * np.finfo(float).eps * shift
         expected = (RIGHT,) if left < 1e-3 else RIGHT_OR_REFUSED
-        outcome = outcome_of(lambda away=away: moved(state.position + away))
+        outcome = attempt(lambda away=away: moved(state.position + away))
         result.add(f"evaluated {shift:.0e} Å away", outcome, max(1e-10, left), x=shift, expected=expected)
         there = state.copy()
         there.position[:] += away
@@ -242,7 +246,7 @@ def far_away(result: CaseResult, quick: bool) -> None:
         result.add(f"from a file, {shift:.0e} Å away", outcome, 0.05, SPLIT, shift, 0.5, RIGHT_OR_REFUSED)
 
 
-@register_case(11, x="density (g/cm³)", error="energy error over kinetic energy", step="fs")
+@register(11, x="density (g/cm³)", error="energy error over kinetic energy", step="fs")
 def densities(result: CaseResult, quick: bool) -> None:
     """From vacuum to three times the density of a liquid: right, or refused because it cannot be packed."""
     for density in (1e-6, 1.0, 3.0) if quick else (1e-12, 1e-6, 1e-3, 0.3, 1.0, 1.5, 2.0, 2.5, 3.0):
@@ -251,7 +255,7 @@ def densities(result: CaseResult, quick: bool) -> None:
         data = molecules_scene(waters, box, 0.25, 200, SPLIT, 298.0, None, cutoff)
         result.add(f"{density:g} g/cm³", run_molecules(data), 0.05, SPLIT, density, 0.25, RIGHT_OR_REFUSED)
     if not quick:
-        result.add("a million points", outcome_of(a_million_points), 0.2, SPLIT, 1.0)
+        result.add("a million points", attempt(a_million_points), 0.2, SPLIT, 1.0)
 
 
 def a_million_points() -> Outcome:
@@ -267,3 +271,87 @@ def a_million_points() -> Outcome:
         return outcome
     taken = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - pages * resource.getpagesize()) / 1e6
     return Outcome(abs(predicted / taken - 1), 0.0)
+
+
+@register(13, error="energy error over kinetic energy", step="fs")
+def strange_molecules(result: CaseResult, quick: bool) -> None:
+    """Coinciding sites, a straight molecule along a diagonal, no mass, negative mass, mass at one point only."""
+
+    def scene(change) -> dict:
+        kind = bent() | {"count": 8}
+        change(kind["sites"])
+        return molecules_scene([kind], BOX, 1.0, 50, SPLIT, 300.0, None, FORCES)
+
+    def set_position(sites, k, position):
+        sites[k]["position_A"] = position
+
+    def set_masses(sites, *values):
+        for site, value in zip(sites, values, strict=True):
+            site["mass_u"] = value
+
+    changes = {
+        "two coinciding sites": lambda s: set_position(s, 1, [-1.0, 0.0, 0.0]),
+        "two sites at 1e-9 Å": lambda s: set_position(s, 1, [-1.0, 1e-9, 0.0]),
+        "all sites coinciding": lambda s: [set_position(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
+        "no mass": lambda s: set_masses(s, 0.0, 0.0, 0.0),
+        "negative mass": lambda s: set_masses(s, 12.0, -1.0, 12.0),
+        "all mass in one site": lambda s: set_masses(s, 0.0, 12.0, 0.0),
+        "massless site off a line of masses": lambda s: set_masses(s, 12.0, 0.0, 12.0),
+    }
+    for setting, change in changes.items():
+        result.add(setting, run_invalid(scene(change)), 0.0, SPLIT, expected=(REFUSED,))
+
+    def slanted(sites):
+        for site, k in zip(sites, (-1.0, 0.0, 1.0), strict=True):
+            site["position_A"] = [0.1 + 0.3 * k, 0.2 + 0.7 * k, 0.3 - 0.9 * k]
+
+    result.add("a straight molecule given in space", run_molecules(scene(slanted)), 0.05, SPLIT)
+
+
+def numbers(data, keys: tuple = ()) -> Iterator[tuple]:
+    """The path of every number in nested tables and lists."""
+    if isinstance(data, dict | list):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from numbers(value, (*keys, key))
+    elif isinstance(data, int | float) and not isinstance(data, bool):
+        yield keys
+
+
+def replaced(data: dict, keys: tuple, value) -> dict:
+    other = copy.deepcopy(data)
+    inner = other
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = value
+    return other
+
+
+@register(13)
+def no_numbers(result: CaseResult, quick: bool) -> None:
+    """NaN and infinity in place of every number of a scene of molecules, of a body, and in structures."""
+    heat = {"temperature_K": 300.0, "thermostat_time_ps": 0.1}
+    molecules = molecules_scene([bent() | {"count": 8}], BOX, 1.0, 10, SPLIT, 300.0, heat, FORCES | {"skin_A": 1.0})
+    tables = {
+        "body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.5, 2.0], "pinned": True, "centre_of_mass_m": [0.0, 0.1, 0.2]},
+        "start": {"euler_angles_deg": [1.0, 2.0, 3.0], "angular_velocity_body_rad_s": [1.0, 2.0, 3.0]},
+        "gravity": {"acceleration_m_s2": [0.0, 0.0, -9.81]},
+        "friction": {"viscous_N_m_s": [0.1, 0.1, 0.1], "dry_N_m": [0.1, 0.1, 0.1]},
+        "applied": [{"torque_N_m": [0.1, 0.2, 0.3], "from_s": 0.1, "to_s": 0.2}],
+    }
+    body = body_scene(tables, 0.01, 1.0, EXACT)
+    for setting, data in (("molecules", molecules), ("body", body)):
+        for keys in numbers(data):
+            for value in (nan, inf, -inf):
+                outcome = run_invalid(replaced(data, keys, value))
+                result.add(
+                    f"{setting}, {'.'.join(map(str, keys))} = {value}", outcome, 0.0, setting, expected=(REFUSED,)
+                )
+    species, state = pair_of(5.0, 0.1)
+    file = molecules_scene(species, BOX, 1.0, 10, SPLIT, None, None, FORCES)
+    for part in ("position", "velocity", "rotation", "angular_momentum_body"):
+        for value in (nan, inf):
+            bad = state.copy()
+            getattr(bad, part)[1] = value
+            result.add(
+                f"structure, {part} = {value}", from_file(file, bad, True), 0.0, "structure", expected=(REFUSED,)
+            )

@@ -23,8 +23,6 @@ DOUBLINGS, RATIO = 10, 1.1
 
 
 class Outcome(NamedTuple):
-    """The outcome of one run."""
-
     error: float = nan  # with respect to the known answer, in the unit of the case
     reported_error: float = nan  # largest error of conserved quantities that the run itself reports, relative
     message: str = ""  # of the rigidmd error that refused or stopped it
@@ -46,7 +44,6 @@ class CaseRun:
 
     @property
     def verdict(self) -> str:
-        """One of `VERDICTS`."""
         seen = self.outcome
         if seen.crash:
             return CRASH
@@ -94,7 +91,6 @@ class CaseResult:
 
     @property
     def families(self) -> list[str]:
-        """Integrators in the order of the runs."""
         return list(dict.fromkeys([t.family for t in self.runs] + [limit.family for limit in self.limits]))
 
     @property

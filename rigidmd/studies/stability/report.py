@@ -10,17 +10,7 @@ import numpy as np
 from rigidmd.core.files import write_text
 from rigidmd.figures.style import INK, curve_style, drawing, label_minor_ticks, open_axis
 from rigidmd.io.write import columns_text, write_csv
-from rigidmd.studies.stability.outcomes import (
-    BOUND,
-    CRASH,
-    REFUSED,
-    REPORTED,
-    RIGHT,
-    UNDETECTED,
-    VERDICTS,
-    CaseResult,
-    StepLimit,
-)
+from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult, StepLimit
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide
 
 FILES = ("stability.csv", "stability.html", "stability.md")
@@ -28,7 +18,6 @@ HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowe
 
 
 def rows(result: CaseResult) -> list[list[str]]:
-    """Lines of the table, one for each integrator of a case."""
     return [_row(result, family) for family in result.families]
 
 
@@ -82,12 +71,10 @@ def conclusions(results: list[CaseResult]) -> list[str]:
 
 
 def has_failed(results: list[CaseResult]) -> bool:
-    """Whether an error was undetected or a run crashed."""
     return any(result.failures for result in results)
 
 
 def write_stability(folder: Path, results: list[CaseResult], command: str, machine: str) -> list[Path]:
-    """Write all files. Returns their paths."""
     titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
     write_csv(folder / FILES[0], [titles, *(line for result in results for line in _csv_lines(result))])
@@ -193,7 +180,7 @@ def _draw_limits(axis, result: CaseResult, family: str, style: dict) -> None:
 
 
 #: How a verdict is shown.
-KINDS = {RIGHT: GOOD, REFUSED: GOOD, REPORTED: DOUBTFUL, UNDETECTED: BAD, CRASH: BAD}
+KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))
 #: Messages of a case at most.
 MESSAGES = 3
 

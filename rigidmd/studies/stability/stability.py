@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import did_you_mean
-from rigidmd.studies.stability import bodies, invalid_input, molecules, water  # noqa: F401  (cases)
+from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
 from rigidmd.studies.stability.cases import CASES, StabilityCase
 from rigidmd.studies.stability.outcomes import CaseResult
 

@@ -7,15 +7,7 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
-from rigidmd.studies.stability.cases import (
-    QUICK,
-    SPLIT,
-    molecules_scene,
-    outcome_of,
-    register_case,
-    run_molecules,
-    simulate,
-)
+from rigidmd.studies.stability.cases import QUICK, SPLIT, attempt, molecules_scene, register, run_molecules, simulate
 from rigidmd.studies.stability.molecules import WATER_FORCES, bent
 from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -55,7 +47,7 @@ TIP4P = [
 ]
 
 
-@register_case(9, x="temperature (K)", error="energy error over kinetic energy (at 1 K, of that at 0 K)", step="fs")
+@register(9, x="temperature (K)", error="energy error over kinetic energy (at 1 K, of that at 0 K)", step="fs")
 def water_steps(result: CaseResult, quick: bool) -> None:
     """Water at 0 K, 10 K, 298 K, 1000 K and 1e5 K: right at a short step, and the longest step that is bounded."""
     for temperature in (298.0,) if quick else (0.0, 10.0, 298.0, 1000.0, 1e5):
@@ -73,7 +65,7 @@ def water_steps(result: CaseResult, quick: bool) -> None:
             result.limits.append(longest_step(at, step, f"{temperature:g} K", family))
 
 
-@register_case(9, x="step (fs)", error="energy error over kinetic energy", step="fs")
+@register(9, x="step (fs)", error="energy error over kinetic energy", step="fs")
 def tip4p_steps(result: CaseResult, quick: bool) -> None:
     """TIP4P at 300 K at 0.5 to 12 fs; according to the literature it is unstable near 10 fs."""
     state = warm("tip4p", 300.0, 1.0)
@@ -116,7 +108,7 @@ def frozen() -> State:
     return state
 
 
-@register_case(14, x="step (fs)", error="T_rot - T_trans, in its standard errors", step="fs")
+@register(14, x="step (fs)", error="T_rot - T_trans, in its standard errors", step="fs")
 def equipartition(result: CaseResult, quick: bool) -> None:
     """T_trans = T_rot in NVT for linear, symmetric, asymmetric bodies and a mixture with points, at two steps."""
     site = {"mass_u": 12.0, "sigma_A": 3.2, "epsilon_K": 80.0}
@@ -148,10 +140,10 @@ def equipartition(result: CaseResult, quick: bool) -> None:
                 gap = abs(rotation - translation) / hypot(its_error, error)
                 return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
 
-            result.add(f"{setting}, {step:g} fs", outcome_of(run), 4.0, SPLIT, step, step)
+            result.add(f"{setting}, {step:g} fs", attempt(run), 4.0, SPLIT, step, step)
 
 
-@register_case(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
+@register(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
 def thermostat(result: CaseResult, quick: bool) -> None:
     """The thermostat with dt / tau from 1e-12 to 1e6: little heat when weak, the canonical mean when strong."""
     state = liquid("spce", 298.0, 1.0, 500)

@@ -36,8 +36,6 @@ class ManifestVersion(BaseModel):
 
 @dataclass
 class SweepPoint:
-    """A point of a sweep."""
-
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
 
     folder: str  # its name
@@ -71,6 +69,10 @@ class Manifest:
     def folder_of(self, values: dict[str, Any]) -> str:
         """The name of the folder for means over the replicas of a combination of values."""
         return point_name(values, short_keys(self.keys))
+
+    def describe(self, values: dict[str, Any]) -> str:
+        """Values for messages: temperature_K = 280, seed = 1."""
+        return describe_values(values, short_keys(self.keys))
 
     def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""

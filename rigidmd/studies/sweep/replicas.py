@@ -13,15 +13,7 @@ from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import nine_digits, write_csv, writing
-from rigidmd.studies.sweep.folder import (
-    FINISHED,
-    Manifest,
-    SweepPoint,
-    describe_values,
-    read_manifest,
-    short_keys,
-    state_on_disk,
-)
+from rigidmd.studies.sweep.folder import FINISHED, Manifest, SweepPoint, read_manifest, state_on_disk
 
 ANALYSES = "analysis.csv"
 
@@ -88,7 +80,7 @@ def _combine(
     failed: dict[str, str],
 ) -> Combination:  # fmt: skip
     """Means over the points of a combination; they are written if there are several."""
-    title = describe_values(values, short_keys(manifest.keys))
+    title = manifest.describe(values)
     runs = [done[point.folder] for point in points if point.folder in done]
     missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
     if not runs:
@@ -139,7 +131,6 @@ def _mean_of(results: list[AnalysisResult], runs: int) -> AnalysisResult:
 
 
 def _mean_value(values: list[Value], runs: int) -> Value:
-    """The mean of a value over those runs that have it."""
     there = [value.value for value in values if value.value is not None]
     if len(there) < 2:
         only = next((value for value in values if value.value is not None), values[0])

@@ -107,7 +107,6 @@ def run_points(
 
 
 def _store_end(folder: Path, point: SweepPoint, message: Message, found: SweepOutcome) -> None:
-    """Store how a point ended."""
     if message.kind == "died":
         if found.signal is not None:  # it was stopped before it sent its end
             point.state = INTERRUPTED

@@ -29,8 +29,6 @@ Send = Callable[[str, Any], None]
 
 
 class PointTask(TypedDict):
-    """One point, as JSON."""
-
     folder: str  # of the sweep
     name: str  # of the point's folder in it
     scene: str
@@ -42,8 +40,6 @@ class PointTask(TypedDict):
 
 
 class PointResult(TypedDict):
-    """How a point ended."""
-
     state: str
     message: str | None
     sha256: str | None  # scene_sha256 of its summary
