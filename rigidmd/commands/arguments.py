@@ -17,13 +17,9 @@ def add_command(
     commands: Commands, name: str, function: Callable[[argparse.Namespace], int], about: str, example: str
 ) -> argparse.ArgumentParser:
     """Add a command, which calls function(options) and returns its exit code."""
-    parser = commands.add_parser(
-        name,
-        help=about,
-        description=about[0].upper() + about[1:] + ".",
-        epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    description, epilog = about[0].upper() + about[1:] + ".", f"example:\n  {example}"
+    form = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(name, help=about, description=description, epilog=epilog, formatter_class=form)
     parser.set_defaults(command=function, writes=False)  # writes: its results are files, not what it prints
     return parser
 

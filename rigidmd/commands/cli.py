@@ -108,12 +108,9 @@ def _did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
     """The parser of a command line, and those of its commands by name."""
-    parser = argparse.ArgumentParser(
-        prog="rigidmd",
-        description="Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene file.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    about = "Molecular dynamics of rigid molecules, and the motion of single rigid bodies, from a scene file."
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("rigidmd", description=about, epilog=EXAMPLES, formatter_class=form)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name in COMMANDS:

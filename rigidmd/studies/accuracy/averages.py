@@ -190,13 +190,11 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
     count = len(simulation.system.model.species)
     series = {
         "U": results["potential"] / count,
-        "T_trans": results["temperature_translation"],
-        "T_rot": results["temperature_rotation"],
+        "T_trans": results["temperature_translation"], "T_rot": results["temperature_rotation"],
         "T_trans unbiased": results["temperature_translation_unbiased"],
         "T_rot unbiased": results["temperature_rotation_unbiased"],
-        "pressure": results["pressure_bar"],
-        "density": results["density"],
-    }
+        "pressure": results["pressure_bar"], "density": results["density"],
+    }  # fmt: skip
     for name, values in series.items():
         average, error = mean_and_error(values[late])
         if average is not None and error is not None:

@@ -88,8 +88,7 @@ def _csv_lines(result: CaseResult) -> list[list]:
     lines = [
         [result.name, result.group, "run", t.setting, t.family, t.step, result.step_unit, t.outcome.error,
          t.allowed, t.outcome.reported_error, t.verdict, " or ".join(t.expected), "", t.outcome.seconds,
-         t.outcome.message or t.outcome.crash]
-        for t in result.runs
+         t.outcome.message or t.outcome.crash] for t in result.runs
     ]  # fmt: skip
     lines += [
         [result.name, result.group, "longest step", limit.setting, limit.family, limit.longest, result.step_unit,

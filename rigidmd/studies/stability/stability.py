@@ -12,13 +12,9 @@ from rigidmd.studies.stability.outcomes import CaseResult
 
 def selected_cases(names: list[str] | None) -> list[StabilityCase]:
     """The cases of these names, or all. Raises SceneError with a suggestion."""
-    errors = [
-        f"unknown case {name!r}{did_you_mean(name, CASES)} (known: {', '.join(CASES)})"
-        for name in names or []
-        if name not in CASES
-    ]
-    if errors:
-        raise SceneError("--case", errors)
+    if unknown := [name for name in names or [] if name not in CASES]:
+        known = f"(known: {', '.join(CASES)})"
+        raise SceneError("--case", [f"unknown case {name!r}{did_you_mean(name, CASES)} {known}" for name in unknown])
     found = [CASES[name] for name in names] if names else CASES.values()
     return sorted(found, key=lambda case: case.group)
 
