@@ -18,7 +18,7 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, refit
-from rigidmd.assemble.scenes import SOURCE, atoms_faults, scene_from_atoms
+from rigidmd.assemble.scenes import SOURCE, atoms_errors, scene_from_atoms
 from rigidmd.assemble.species import species_of
 from rigidmd.core.state import State, state_of
 from rigidmd.engines.cpu import Engine
@@ -171,7 +171,7 @@ class RigidMD(Calculator):
 
     def _fit_atoms(self, atoms: Atoms) -> "_FittedAtoms":
         """Rigid molecules fitted to the atoms, as matched before if this still fits."""
-        if faults := atoms_faults(atoms):
+        if faults := atoms_errors(atoms):
             raise SceneError(SOURCE, faults)
         if self._assembly is not None and self._assembly.applies_to(atoms):
             fitted = self._assembly.fit(atoms)

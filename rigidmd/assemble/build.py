@@ -38,7 +38,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
     resolved = with_defaults(scene, Composition(species, counts, space, start.basis))
-    if faults := [*faults, *resolved.faults]:
+    if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
     model = _model(species, index, frozen)

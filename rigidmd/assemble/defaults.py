@@ -110,7 +110,7 @@ class SceneWithDefaults(NamedTuple):
     """A scene with its defaults filled in, and error messages. With errors some defaults may be missing."""
 
     scene: MolecularScene
-    faults: list[str]
+    errors: list[str]
     #: Grid points along the edges of the box; forces.pme_grid of the scene refers to the edges of the given cell.
     pme_grid: tuple[int, int, int] | None
 
@@ -182,7 +182,7 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
         faults.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:
         faults.append("forces.tail_correction needs a periodic box, filled by a uniform liquid beyond the cutoff")
-    faults += _electrostatic_faults(forces, space, cutoff)
+    faults += _electrostatic_errors(forces, space, cutoff)
     if start is None and cutoff < inf and "switch" in forces.truncation:
         start = default_switch_start(forces.truncation, cutoff)
     return {"cutoff_A": given, "switch_start_A": start}, faults
@@ -192,7 +192,7 @@ def _default(given: object) -> str:
     return "" if given else " (the default)"
 
 
-def _electrostatic_faults(forces: Forces, space: Space, cutoff: float) -> list[str]:
+def _electrostatic_errors(forces: Forces, space: Space, cutoff: float) -> list[str]:
     """Messages on electrostatics that this box does not allow."""
     method = forces.electrostatics
     if method in ("ewald", "pme") and space.volume == inf:

@@ -53,7 +53,7 @@ def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTup
         if isinstance(term, LennardJonesWalls) and (behind := term.behind(parts.state)) is not None:
             name = parts.species[model.species[behind.molecule]].name
             faults.append(f"fields.walls.{k}: at the start, molecule {behind.molecule + 1} ({name}) {behind}")
-    faults += _gap_faults(scene, parts, moves)
+    faults += _gap_errors(scene, parts, moves)
     for k in range(len(fields.restraints)):
         if (term := _restraints(scene, k, parts, faults)) is not None:
             terms[f"restraints_{k}"] = term
@@ -103,7 +103,7 @@ def _acted_on(walls: Walls, species: list[Molecule], moves: np.ndarray) -> list[
     return [points if free else points[:0] for points, free in zip(offsets, moves, strict=True)]
 
 
-def _gap_faults(scene: MolecularScene, parts: SystemParts, moves: np.ndarray) -> list[str]:
+def _gap_errors(scene: MolecularScene, parts: SystemParts, moves: np.ndarray) -> list[str]:
     """Messages on walls that do not fit into a periodic box, or too close to their periodic images."""
     fields, space = scene.fields, parts.space
     if not fields.walls or isinstance(space, Unbounded):

@@ -61,12 +61,12 @@ def scene_from_atoms(
 
     Raises SceneError. Atoms that do not match the models are found when the system is built.
     """
-    if faults := atoms_faults(atoms):
+    if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
     data = plain_values(settings)
     faults = [f"{key} is given by the atoms and models" for key in ("molecules",) if key in data]
     structure, start, box = (data.setdefault(key, {}) for key in ("structure", "start", "box"))
-    if faults := faults + _faults_of_tables(data):
+    if faults := faults + _table_errors(data):
         raise SceneError(SOURCE, faults)
     has_momenta = atoms.has("momenta")
     draws = start.get("temperature_K") is not None
@@ -83,7 +83,7 @@ def scene_from_atoms(
     return MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
 
 
-def atoms_faults(atoms: Any) -> list[str]:
+def atoms_errors(atoms: Any) -> list[str]:
     """Messages on an object that is not an `ase.Atoms`, or cannot consist of molecules."""
     import ase
 
@@ -144,7 +144,7 @@ def _digits(values: np.ndarray) -> list[list[str]]:
     return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
 
 
-def _faults_of_tables(data: Mapping[str, Any]) -> list[str]:
+def _table_errors(data: Mapping[str, Any]) -> list[str]:
     """Messages on tables that the atoms fill in."""
     wrong = {key: type(data[key]) for key in ("structure", "start", "box") if not isinstance(data[key], Mapping)}
     if wrong:

@@ -114,7 +114,7 @@ class BodyTable(Section):
     centre_of_mass_m: Vector | None = None
     """Centre of mass of a pinned body, from the pivot, along the body axes"""
 
-    def _faults(self):
+    def _errors(self):
         faults = []
         ways = [key for key in ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2") if getattr(self, key)]
         if len(ways) > 1:
@@ -186,7 +186,7 @@ class BodyStart(Section):
     velocity_m_s: Vector | None = None
     """Velocity of the centre of mass of a body that is not pinned"""
 
-    def _faults(self):
+    def _errors(self):
         attitudes = ("euler_angles_deg", "yaw_pitch_roll_deg", "quaternion_wxyz", "rotation", "attitude_matrix")
         spins = ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")
         for keys in (attitudes, spins):
@@ -270,7 +270,7 @@ class Run(Section):
     absolute_tolerance: Positive | None = None
     """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
 
-    def _faults(self):
+    def _errors(self):
         if self.rotor is not None and self.integrator in SOLVERS:
             yield f"rotor would do nothing with {self.integrator}"
         elif fault := self.rotor and rotor_error(self.integrator, self.rotor):
@@ -391,7 +391,7 @@ class BodyScene(Scene):
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
         return [f"{location_of(keys, text)}: {fault}" for keys, fault in found]
 
-    def _faults(self):
+    def _errors(self):
         fluid, body = self.fluid, self.body
         if fluid is not None:
             if fluid.density_kg_m3 is not None:

@@ -40,7 +40,7 @@ class Timed(Section):
                 raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
         return times
 
-    def timing_faults(self, values: dict[str, Any], entry: type) -> list[str]:
+    def timing_errors(self, values: dict[str, Any], entry: type) -> list[str]:
         """Messages on quantities that do not match the times; a single value has the type `entry`."""
         faults, times = [], self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
@@ -80,8 +80,8 @@ class Applied(Timed):
     """Point of action, along the body axes, from the centre of mass, or from the pivot of a pinned body; default: that
     point itself"""
 
-    def _faults(self):
-        yield from self.timing_faults({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
+    def _errors(self):
+        yield from self.timing_errors({"force_N": self.force_N, "torque_N_m": self.torque_N_m}, tuple)
         if self.force_N is None and self.torque_N_m is None:
             yield "needs force_N or torque_N_m"
         if self.at_m is not None and self.force_N is None:
@@ -131,9 +131,9 @@ class Frame(Timed):
     origin_acceleration_m_s2: Vector | tuple[Vector, ...] | None = None
     """Acceleration of the frame's origin, along the frame's axes; the body has the opposite acceleration"""
 
-    def _faults(self):
+    def _errors(self):
         timed = {key: getattr(self, key) for key in ("angular_velocity_rad_s", "origin_acceleration_m_s2")}
-        yield from self.timing_faults(timed, tuple)
+        yield from self.timing_errors(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
             yield "from_s and to_s are not supported here; use times_s"
         if self.angular_acceleration_rad_s2 is not None and self.times_s is not None:
@@ -152,8 +152,8 @@ class Wheel(Timed):
     motor_torque_N_m: Number | tuple[Number, ...] | None = None
     """Torque of the motor on the wheel; the opposite torque acts on the body"""
 
-    def _faults(self):
-        yield from self.timing_faults({"motor_torque_N_m": self.motor_torque_N_m}, float)
+    def _errors(self):
+        yield from self.timing_errors({"motor_torque_N_m": self.motor_torque_N_m}, float)
         if not any(self.axis):
             yield "axis is zero, which is not a direction"
         idle = [key for key in ("times_s", "from_s", "to_s") if getattr(self, key) is not None]
@@ -168,9 +168,9 @@ class ChangingInertia(Timed):
     inertia_kg_m2: tuple[PositiveVector, ...]
     """Principal moments at each time"""
 
-    def _faults(self):
+    def _errors(self):
         timed = {"inertia_kg_m2": self.inertia_kg_m2}
-        yield from ["times_s is missing"] if self.times_s is None else self.timing_faults(timed, tuple)
+        yield from ["times_s is missing"] if self.times_s is None else self.timing_errors(timed, tuple)
         if self.from_s is not None or self.to_s is not None:
             yield "from_s and to_s are not supported here; use times_s"
         for k, moments in enumerate(self.inertia_kg_m2):

@@ -43,7 +43,7 @@ class Walls(Section):
     stiffness_kJ_mol_A2: Positive | None = None
     """Stiffness of harmonic"""
 
-    def _faults(self):
+    def _errors(self):
         for kind, keys in KEYS_OF_WALLS.items():
             given = [key for key in keys if getattr(self, key) is not None]
             if kind != self.kind and given:
@@ -118,7 +118,7 @@ class Fields(Section):
     restraints: tuple[Restraint, ...] = Field(default=(), max_length=MOST_TABLES)
     """Springs on centres of mass"""
 
-    def _faults(self):
+    def _errors(self):
         if self.electric_frequency_per_ps is not None and self.electric_V_per_nm is None:
             yield "electric_frequency_per_ps would do nothing without electric_V_per_nm"
         if self.electric_phase_deg and self.electric_frequency_per_ps is None:
@@ -136,7 +136,7 @@ class Fields(Section):
         return (max(lower for lower, _ in ranges), min(upper for _, upper in ranges)) if ranges else None
 
 
-def field_faults(scene: "MolecularScene") -> list[str]:
+def field_errors(scene: "MolecularScene") -> list[str]:
     """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
     held = bool(fields.restraints) or any(species.frozen for species in scene.molecules)

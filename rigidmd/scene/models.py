@@ -335,7 +335,7 @@ def _shipped() -> tuple[str, ...]:
 
 
 @cache
-def model_fault(name: str) -> str:
+def model_error(name: str) -> str:
     """The message on an unknown model; empty for a known one."""
     known = available_models()
     if name in known:
@@ -345,7 +345,7 @@ def model_fault(name: str) -> str:
 
 def load_model(name: str) -> Molecule:
     """A shipped model by name. Raises MoleculeError."""
-    if fault := model_fault(name):
+    if fault := model_error(name):
         raise MoleculeError("models", [fault])
     return read_molecule(MODELS / f"{name}.toml")
 

@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, Strict, field_validator, model_validato
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
 from rigidmd.scene.base import Scene, file_name
-from rigidmd.scene.fields import Fields, field_faults
+from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
@@ -287,7 +287,7 @@ class MolecularScene(Scene):
         candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGY_NAMES]
         return next((name for name in candidates if self.path(name).is_file()), None)
 
-    def _faults(self):
+    def _errors(self):
         if self.structure is None:
             yield from [
                 f"molecules.{k}.count is missing (required without a structure file)"
@@ -311,7 +311,7 @@ class MolecularScene(Scene):
         rescaled = first is not None and first.thermostat_kind in ("velocity_rescaling", "nose_hoover")
         if self.start.temperature_K == 0 and rescaled:
             yield "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest"
-        yield from self._barostat_faults()
+        yield from self._barostat_errors()
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
@@ -319,10 +319,10 @@ class MolecularScene(Scene):
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A
         if start is not None and cutoff is not None and start >= cutoff:
             yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
-        yield from field_faults(self)
+        yield from field_errors(self)
         yield from self._uneven_frames()
 
-    def _barostat_faults(self) -> list[str]:
+    def _barostat_errors(self) -> list[str]:
         """Messages on stages with a barostat."""
         reasons = {
             "box.periodic is false": not self.box.periodic,

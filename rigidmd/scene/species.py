@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.scene.models import Site, SiteName, model_fault
+from rigidmd.scene.models import Site, SiteName, model_error
 from rigidmd.scene.validation import Count, Flag, Line, Positive, Section
 
 #: Keys of [[molecules]] that name a file.
@@ -53,7 +53,7 @@ class Molecules(Section):
     @field_validator("model")
     @classmethod
     def _is_known(cls, model: str | None):
-        if model is not None and (fault := model_fault(model)):
+        if model is not None and (fault := model_error(model)):
             raise ValueError(fault)
         return model
 

@@ -159,7 +159,7 @@ class Stage(Section):
             raise ValueError("is missing")
         return duration
 
-    def _faults(self):
+    def _errors(self):
         if self.has_thermostat and self.temperature_K is None:
             yield f"an {self.ensemble} stage needs temperature_K"
         if self.has_barostat and self.pressure_bar is None:
@@ -169,7 +169,7 @@ class Stage(Section):
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
-            yield from self._pressure_faults()
+            yield from self._pressure_errors()
         if fault := rotor_error(self.integrator, self.rotor):
             yield fault
         given = [key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default]
@@ -205,7 +205,7 @@ class Stage(Section):
         kinds = ((self.thermostat_kind, Thermostat.__args__), (self.barostat_kind, Barostat.__args__))
         return f"with {' and '.join(kind for kind, among in kinds if kind and concerned & set(among))}"
 
-    def _pressure_faults(self) -> list[str]:
+    def _pressure_errors(self) -> list[str]:
         faults, given, coupling = [], self.pressure_bar, self.pressure_coupling
         several = len(given) if isinstance(given, tuple) else 1
         if self.is_minimisation and several == 2:

@@ -37,11 +37,11 @@ class Section(BaseModel):
 
     @model_validator(mode="after")
     def _is_sound(self):
-        if faults := "; ".join(self._faults()):
+        if faults := "; ".join(self._errors()):
             raise ValueError(faults)
         return self
 
-    def _faults(self) -> Iterable[str]:
+    def _errors(self) -> Iterable[str]:
         """Messages on keys of this table that contradict each other."""
         return ()
 
