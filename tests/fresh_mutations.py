@@ -233,7 +233,7 @@ FRESH: list[Mutation] = [
     Mutation(
         "F33", "averages against the step: what comes before equilibrium counts",
         "studies/accuracy/averages.py",
-        "    late = results[\"time\"] > SETTLING * sample",
+        "    late = results[\"time\"] > EQUILIBRATION * sample",
         "    late = results[\"time\"] > 0",
         ("test_accuracy.py::test_averages_leave_out_what_comes_before_equilibrium",),
     ),
