@@ -80,16 +80,10 @@ class RigidMD(Calculator):
     nolabel = True
 
     def __init__(
-        self,
-        models: MolecularScene | str | Sequence[str | Mapping[str, Any]],
-        *,
-        atom_forces: Form = "gradient",
-        bend: float = 0.05,
-        tolerance: float = 0.15,
-        precision: str | None = None,
-        fields: Mapping[str, Any] | None = None,
-        **forces: Any,
-    ):
+        self, models: MolecularScene | str | Sequence[str | Mapping[str, Any]], *, atom_forces: Form = "gradient",
+        bend: float = 0.05, tolerance: float = 0.15, precision: str | None = None,
+        fields: Mapping[str, Any] | None = None, **forces: Any,
+    ):  # fmt: skip
         super().__init__()
         faults = []
         if atom_forces not in ("gradient", "sites"):
@@ -191,11 +185,9 @@ class RigidMD(Calculator):
         bare = atoms.copy()
         bare.set_constraint()
         bare.arrays.pop("momenta", None)
-        settings = self._settings | {
-            "structure": {"tolerance": self._tolerance},
-            "stages": [{"ensemble": "minimise", **stage_keys}],
-        }
-        scene = scene_from_atoms(bare, self._models, **settings)
+        stages = [{"ensemble": "minimise", **stage_keys}]
+        structure = {"tolerance": self._tolerance}
+        scene = scene_from_atoms(bare, self._models, structure=structure, stages=stages, **self._settings)
         if self._user_forces:
             scene = scene.with_user_code(self._user_forces)
         system = build(scene)

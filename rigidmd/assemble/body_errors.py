@@ -102,10 +102,8 @@ def torque_errors(entry: Applied, k: int, axes: np.ndarray, moments: np.ndarray,
 
 
 def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
-    """Messages on integrators that cannot move this body, or lose their order.
-
-    immersed : whether the fluid adds mass. has_functions : whether Python functions apply forces
-    """
+    """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid adds mass;
+    has_functions: Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
     resisted = not isinstance(resistance, NoResistance)
     if run.is_auto:

@@ -110,19 +110,14 @@ def with_user_code(system: System) -> System:
 
     added = user_terms(system)
     model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.changes_momentum)
+    # Forces computed by Python come first: as long as they are missing, no other need be computed.
+    terms = {name: added.terms[name] for name in added.python_forces} | system.terms | added.terms
     return replace(
-        system,
-        scene=with_momentum_removal(system.scene, model.keeps_momentum),
-        # Forces computed by Python come first: as long as they are missing, no other need be computed.
-        terms={name: added.terms[name] for name in added.python_forces} | system.terms | added.terms,
-        model=model,
-        freedom=count_degrees_of_freedom(model),
-        python_forces=added.python_forces,
-        thermostat=added.thermostat,
+        system, scene=with_momentum_removal(system.scene, model.keeps_momentum), terms=terms, model=model,
+        freedom=count_degrees_of_freedom(model), python_forces=added.python_forces, thermostat=added.thermostat,
         tail=sum_of_tails([*([system.tail] if system.tail is not None else []), *added.tails]),
-        user_terms=added.descriptions,
-        notes=[*system.notes, *added.notes],
-    )
+        user_terms=added.descriptions, notes=[*system.notes, *added.notes],
+    )  # fmt: skip
 
 
 def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:

@@ -149,10 +149,8 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
 
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
-    """A scene with the default of run.remove_momentum_interval_ps.
-
-    keeps_momentum (3,) : the components of the total momentum that the terms conserve
-    """
+    """A scene with the default of run.remove_momentum_interval_ps. Terms conserve the components keeps_momentum (3,) of
+    the total momentum."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
     removed = scene.forces.electrostatics == "pme" and keeps_momentum.any()
@@ -216,9 +214,7 @@ def _ewald(
     forces: Forces, composition: Composition, cutoff: float
 ) -> tuple[dict[str, Any], list[str], tuple[int, int, int] | None]:
     """Numbers of an Ewald sum as keys of [forces], error messages, and the grid of PME along the edges of the box.
-
-    ewald_accuracy becomes None when all numbers that follow from it are set.
-    """
+    ewald_accuracy becomes None when all numbers that follow from it are set."""
     usual = "plain" if forces.truncation == "plain" else "shift"
     numbers: dict[str, Any] = {"ewald_truncation": forces.ewald_truncation or usual}
     charges = composition.charges
@@ -280,10 +276,8 @@ def _number_of_k_vectors(forces: Forces, radius: float | None, volume: float) ->
 
 
 def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:
-    """A scene of a single body with all defaults.
-
-    rotates : whether the body has an orientation. radius : of the points in its trajectory, m
-    """
+    """A scene of a single body with all defaults; rotates: the body has an orientation; radius: of the points in its
+    trajectory, m."""
     run, watch = scene.run, scene.watch
     solver = run.integrator in SOLVERS
     if solver:

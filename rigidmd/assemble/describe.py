@@ -32,10 +32,7 @@ PRECISIONS = {
 
 
 def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
-    """How a scene would run. Raises the errors of `build` or `build_body`.
-
-    user_code : see `build`
-    """
+    """How a scene would run. Raises the errors of `build` or `build_body`; user_code: see `build`."""
     if isinstance(scene, MolecularScene):
         return _describe_molecules(build(scene, user_code))
     text = _describe_body(build_body(scene))

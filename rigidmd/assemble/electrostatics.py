@@ -210,10 +210,8 @@ def _frozen_correction(
     charged: ChargedSites, charge: np.ndarray, space: Space, alpha: float, vectors: k_vectors.KVectors,
     permittivity: float, state: State,
 ) -> tuple[float, float]:  # fmt: skip
-    """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images.
-
-    charge (s,) : 0 for sites that move
-    """
+    """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
+    (s,) is 0 for sites that move."""
     sites, volume = charged.sites, space.volume
     arms = np.zeros((len(charge), 3))
     if len(state.rotation):

@@ -55,10 +55,8 @@ def massive_sites(molecule: Molecule) -> np.ndarray:
 def match(
     atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float
 ) -> MatchedMolecules | list[str]:
-    """The molecules that the atoms form, or error messages.
-
-    cell : lattice (3, 3) across whose faces molecules may be split, or None. tolerance : see Scene.structure
-    """
+    """The molecules that the atoms form, or error messages. The cell (3, 3), if any, has faces across which molecules
+    may be split; tolerance: see Scene.structure."""
     kinds = _kinds(atoms, species)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
     by_residue = _match_groups(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
@@ -168,10 +166,8 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
-    """Groups of atoms with mass, in file order, that are connected by bonds as long as the bonds of the templates.
-
-    The bonds of a template are the edges of its minimum spanning tree.
-    """
+    """Groups of atoms with mass, in file order, connected by bonds as long as the bonds of the templates, which are the
+    edges of their minimum spanning trees."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
     from scipy.spatial.distance import cdist
@@ -258,11 +254,8 @@ def _composition(molecule: Molecule) -> str:
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
-    """A run of atoms as a molecule of this species, or None.
-
-    Atoms are assigned by names that occur as often among the atoms as among the sites, and by element among the rest.
-    The order of atoms with the same name follows from the geometry.
-    """
+    """A run of atoms as a molecule of this species, or None. Atoms are assigned by names that occur as often among the
+    atoms as among the sites, else by element. The order of atoms with the same name follows from the geometry."""
     sites = massive_sites(molecule)
     labels = _labels(molecule)
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
@@ -335,10 +328,8 @@ def _fit_group(
 def _fit_in_any_order(
     position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: list[np.ndarray], tolerance: float
 ) -> TemplateFit:
-    """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits.
-
-    allowed : see _Candidate; each is tried where the ones before it give no fit
-    """
+    """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits. Each
+    mask of `allowed`, see _Candidate, is tried where the ones before it give no fit."""
     limit = tolerance * molecule.radius
     points = _make_whole(position[order], cell)
     fit = _fit(points, molecule)
@@ -370,10 +361,8 @@ def _least_deviation(
 
 
 def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
-    """Which molecules (m, s, 3) have the same sorted distances between two kinds of atoms as the template.
-
-    In a molecule that fits, every distance agrees with the template within twice the limit, and so do sorted ones.
-    """
+    """Which molecules (m, s, 3) have the same sorted distances between two kinds of atoms as the template, within twice
+    the limit, as every molecule that fits does."""
     template = molecule.positions_body[massive_sites(molecule)]
     i, j = np.triu_indices(len(template), 1)
     kind = allowed.argmax(axis=1)
@@ -412,11 +401,9 @@ def _fit(points: np.ndarray, molecule: Molecule) -> TemplateFit:
 def _search_order(
     points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, most: int = MOST_TRIES
 ) -> list[int] | None:
-    """An order of the atoms (s, 3) in which the template fits within `limit`, or None.
-
-    A depth-first search assigns atoms to sites one by one so that all distances agree: first closely, then up to twice
-    the limit, which every fit within the limit satisfies.
-    """
+    """An order of the atoms (s, 3) in which the template fits within `limit`, or None. A depth-first search assigns
+    atoms to sites one by one so that all distances agree: first closely, then up to twice the limit, which every fit
+    within the limit satisfies."""
     template = molecule.positions_body[massive_sites(molecule)]
     wanted = np.linalg.norm(template[:, None] - template, axis=2)
     there = np.linalg.norm(points[:, None] - points, axis=2)

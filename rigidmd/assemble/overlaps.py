@@ -49,10 +49,8 @@ def every_site(molecule: Molecule) -> np.ndarray:
 def close_pairs(
     system: "System", state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
 ) -> list[tuple[int, int, float]]:
-    """Sites (i, j) of different molecules, not both frozen, that are close to each other, and their distances, Å.
-
-    wanted : pairs of a radius, and a function that returns the indices of the sites of a molecule to which it applies
-    """
+    """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances, Å. `wanted` are
+    radii, and functions for the indices of the sites of a molecule to which they apply."""
     species, reach = system.species, 0.0
     for radius, sites_of in wanted:
         arm = max(np.linalg.norm(m.positions_body[sites_of(m)], axis=1).max(initial=0.0) for m in species)

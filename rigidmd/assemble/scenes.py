@@ -32,11 +32,8 @@ SHAPES = {"FixLinearTriatomic", "FixInternals"}
 
 
 def resolve(scene: AnyScene) -> AnyScene:
-    """The same scene with all defaults, which runs to the same bits.
-
-    The integrator "auto" stays until a run has chosen one. Raises SceneError, and for molecules
-    StructureError and MoleculeError.
-    """
+    """The same scene with all defaults, which runs to the same bits. The integrator "auto" stays until a run has chosen
+    one. Raises SceneError, and for molecules StructureError and MoleculeError."""
     return build_body(scene).scene if isinstance(scene, BodyScene) else build(scene).scene
 
 

@@ -60,9 +60,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
 
 def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
     """Sites with positions from a file and parameters from given entries or a table, by atom name or else by element.
-
-    where : name of the entries in messages. Raises StructureError with all errors.
-    """
+    `where` names the entries in messages. Raises StructureError with all errors."""
     faults, sites, used = [], [], set()
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
         match, shared = find_site(given, name, element), find_site(table, name, element)

@@ -93,10 +93,8 @@ def read_structure(
 
 
 def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Configuration:
-    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff.
-
-    whose : owner of the lattice, for the note
-    """
+    """The same configuration in a cell with small tilts; rotated, if this allows a longer cutoff. `whose` is the owner
+    of the lattice, for the note."""
     if found.cell is None:
         return found
     cell, rotation = least_skewed_cell(found.cell) if may_rotate else (reduced_cell(found.cell), np.eye(3))
@@ -250,10 +248,8 @@ def _massless(matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
 
 
 def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], notes: list[str]):
-    """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None.
-
-    About axes without inertia (linear bodies, points) the angular momentum is 0.
-    """
+    """Velocities (n, 3) and body angular momenta (n, 3) with the momenta of the atoms, or None. About axes without
+    inertia (linear bodies, points) the angular momentum is 0."""
     if atoms.velocity is None:
         return None, None
     without = np.array(np.isnan(atoms.velocity).any(axis=1))

@@ -26,10 +26,8 @@ def _sites_of(species: list[Molecule], model: Model, indices: list[np.ndarray]):
 
 
 def _named_pairs(scene: MolecularScene, species: list[Molecule]) -> list[np.ndarray]:
-    """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs means the site.
-
-    Raises SceneError.
-    """
+    """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs means the site. Raises
+    SceneError."""
     found = [np.zeros((len(scene.forces.pairs), 2, len(m.site_names)), bool) for m in species]
     faults = []
     for n, entry in enumerate(scene.forces.pairs):
@@ -49,10 +47,7 @@ def interactions(
     scene: MolecularScene, species: list[Molecule], model: Model, space: Space, state: State, basis: np.ndarray,
     pme_grid: tuple[int, int, int] | None,
 ) -> Interactions:  # fmt: skip
-    """The interactions of a resolved scene. Raises SceneError.
-
-    basis, pme_grid : see `electrostatics`
-    """
+    """The interactions of a resolved scene. Raises SceneError. basis, pme_grid: see `electrostatics`."""
     found, index = Interactions({}, {}), model.species
     frozen = (model.inverse_mass == 0)[index]
     named = _named_pairs(scene, species)
@@ -71,10 +66,7 @@ def interactions(
     sites = _sites_of(species, model, indices)
     charged = ChargedSites(species, index, frozen, indices, sites, exclusion_groups(sites, frozen))
     added = electrostatics(scene, charged, space, state, basis, pme_grid)
-    return Interactions(
-        found.terms | added.terms, added.constants, added.pressure, found.tail, added.force_error,
-        found.notes + added.notes,
-    )  # fmt: skip
+    return added._replace(terms=found.terms | added.terms, tail=found.tail, notes=found.notes + added.notes)
 
 
 def _lennard_jones(

@@ -42,10 +42,8 @@ AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
 
 class Scene(Section, Displayed):
-    """The complete description of a run. Read one with `Scene.read(path)`.
-
-    A scene with a table [body] is a `BodyScene`, any other a `MolecularScene`.
-    """
+    """The complete description of a run: a `BodyScene` if it has a table [body], else a `MolecularScene`. Read one with
+    `Scene.read(path)`."""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run; default: the name of the file"""
@@ -262,10 +260,8 @@ def _has_key(data: Any, key: str) -> bool:
 
 
 def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
-    """Set one dotted key in nested tables and lists in place; None removes it.
-
-    Returns the key, in which entries of lists are given by number and not by name, and error messages.
-    """
+    """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, with numbers for names
+    of entries of lists, and error messages."""
     if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.[^.]+\.(file|parameters)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)

@@ -59,10 +59,8 @@ def not_none(value: T | None) -> T:
 def validation_messages(
     error: ValidationError, model: type[BaseModel], text: str = "", overridden: Iterable[str] = ()
 ) -> list[str]:
-    """One message for each error of pydantic: line (if the TOML text is given), key, what was expected.
-
-    overridden : dotted keys whose values come from the command line and have no line
-    """
+    """One message for each error of pydantic: line (if the TOML text is given), key, what was expected. Keys in
+    `overridden` are set by the command line and have no line."""
     faults: dict[tuple, list[str]] = {}
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
@@ -84,10 +82,8 @@ def validation_messages(
 
 
 def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
-    """Path of keys and message of numbers in nested tables and lists whose absolute value is outside these limits.
-
-    Infinities and NaN, which some keys allow, are checked by the types of these keys.
-    """
+    """Path of keys and message of numbers in nested tables and lists whose absolute value is outside these limits. The
+    types of keys check infinities and NaN."""
     found: list[tuple[list, str]] = []
     rest: list[tuple[list, Any]] = [([], data)]
     while rest:

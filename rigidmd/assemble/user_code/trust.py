@@ -14,10 +14,8 @@ _TRUSTED: set[str] = set()
 
 
 def trust(path: str | Path) -> None:
-    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError.
-
-    The code can do anything that you can do: read it before. On the command line, --trust FILE does the same.
-    """
+    """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The code can do anything
+    that you can do: read it before. On the command line, --trust FILE does the same."""
     _TRUSTED.add(digest_of(_source(Path(path), "--trust")))
 
 
