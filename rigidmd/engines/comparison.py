@@ -22,8 +22,6 @@ PER_SITE = 0.02
 
 
 class Comparison(NamedTuple):
-    """One quantity computed by two engines."""
-
     name: str
     unit: str
     here: float

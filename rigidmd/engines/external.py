@@ -6,17 +6,20 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, Load, State
+from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.cpu import keep_time
 from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.protocol import Tally
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 
 
-class ExternalEngine(ABC):
-    """Base of the engines that run another program (see `protocol.Engine`). The stage of the scene sets its motion."""
+class ExternalEngine(Engine, ABC):
+    """Base of the engines that run another program. A stage of the scene determines the motion.
+
+    Of the tallies of `evaluate`, the first one has the virial of all terms.
+    """
 
     version: str  # name and version of the program
     moves: tuple[int, int] = (0, 0)  # moves of the box, tried and accepted; (0, 0) if the program does not report them
@@ -33,9 +36,6 @@ class ExternalEngine(ABC):
     def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
         """None: the program itself keeps the variables of its thermostat and barostat."""
         return np.zeros(0)
-
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        return state.copy()._replace(extra_variables=self.variables(state, row))
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         keep_time(state, dt)
@@ -57,20 +57,6 @@ class ExternalEngine(ABC):
 
     def forget(self) -> None:
         self._known_state = None
-
-    @abstractmethod
-    def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        """Forces and torques at a state, and the energy of each term. The first tally has the virial of all terms."""
-
-    def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        return self.evaluate(state)
-
-    @abstractmethod
-    def memory(self) -> dict[str, np.ndarray]:
-        """What the next steps depend on besides the state, as far as the program gives it."""
-
-    @abstractmethod
-    def recall(self, state: State, memory: dict[str, np.ndarray]) -> None: ...
 
     @abstractmethod
     def rotor(self, model: Model) -> "NamedTuple | None":

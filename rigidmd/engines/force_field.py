@@ -84,10 +84,8 @@ class ForceFieldView(NamedTuple):
 def force_field_of(system: System) -> ForceFieldView:
     """The force field of a system. It leaves out the terms that `unsupported_terms` lists."""
     index = system.model.species
-    parameters = [
-        list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), kind, strict=True))
-        for m, kind in zip(system.species, _lennard_jones_kinds(system), strict=True)
-    ]
+    per_species = zip(system.species, _lennard_jones_kinds(system), strict=True)
+    parameters = [list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), k, strict=True)) for m, k in per_species]
     first: dict[tuple, str] = {}  # parameters of a kind -> name of its first site
     for m, of_sites in zip(system.species, parameters, strict=True):
         for site, of_site in zip(m.site_names, of_sites, strict=True):
@@ -97,27 +95,17 @@ def force_field_of(system: System) -> ForceFieldView:
     of_species = [np.array([order[of_site] for of_site in of_sites]) for of_sites in parameters]
     lennard_jones = _potential(system, "lennard_jones", LennardJones)
     sigma, epsilon = _pairs([of_kind[3] for of_kind in first], lennard_jones)
+    coulomb = _potential(system, "coulomb", ReactionField) or _potential(system, "coulomb", DampedShiftedForce)
     return ForceFieldView(
-        system=system,
-        kinds=kinds,
-        kind=gather_per_molecule(of_species, index),
-        frozen=(system.model.inverse_mass == 0)[index],
-        sigma=sigma,
-        epsilon=epsilon,
-        lennard_jones=lennard_jones,
-        coulomb=_potential(system, "coulomb", ReactionField)
-        or _potential(system, "coulomb", DampedShiftedForce)
-        or _potential(system, "coulomb_real", ScreenedCoulomb),
-    )
+        system, kinds, gather_per_molecule(of_species, index), (system.model.inverse_mass == 0)[index], sigma, epsilon,
+        lennard_jones, coulomb or _potential(system, "coulomb_real", ScreenedCoulomb),
+    )  # fmt: skip
 
 
 def unsupported_terms(system: System) -> list[str]:
     """Descriptions of the terms of a system that no other program has."""
-    found = [
-        f"{name.replace('_', ' ')}: {'a user-defined force' if name in system.user_terms else 'a field'}"
-        for name in system.terms
-        if name not in KNOWN
-    ]
+    kind = {name: "a user-defined force" if name in system.user_terms else "a field" for name in system.terms}
+    found = [f"{name.replace('_', ' ')}: {kind[name]}" for name in system.terms if name not in KNOWN]
     if "coulomb_surface" in system.terms:
         found.append("forces.ewald_surface_permittivity: a surface term")
     if system.thermostat is not None:

@@ -106,7 +106,6 @@ def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
 
 
 def _virtual_site(points: np.ndarray, where: np.ndarray, limit: float) -> VirtualSite:
-    """The virtual site of points (p, 3) at `where` (3,)."""
     if len(points) == 1:
         return VirtualSite(np.ones(1), 0.0)
     edges = (points[1:] - points[0]).T

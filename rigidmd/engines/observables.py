@@ -140,20 +140,14 @@ def observe(
     if volume < inf:
         pressure = (sums.flow + (virial + virial.T) / 2) / volume + (system.constant_pressure + tail_pressure) * UNIT
     return Observation(
-        components=components,
-        virial=virial,
-        kinetic_translation=translation,
-        kinetic_rotation=rotation,
+        components=components, virial=virial, kinetic_translation=translation, kinetic_rotation=rotation,
         temperature_translation=_temperature(translation, freedom.translation),
         temperature_rotation=_temperature(rotation, freedom.rotation),
         temperature=_temperature(translation + rotation, freedom.total),
         temperature_translation_unbiased=_temperature(translation_unbiased, freedom.translation),
-        temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation),
-        pressure_tensor=pressure,
-        momentum=sums.momentum,
-        orthogonality_error=sums.orthogonality_error,
-        load=load,
-    )
+        temperature_rotation_unbiased=_temperature(rotation_unbiased, freedom.rotation), pressure_tensor=pressure,
+        momentum=sums.momentum, orthogonality_error=sums.orthogonality_error, load=load,
+    )  # fmt: skip
 
 
 def kinetic_energies(system: System, state: State) -> tuple[float, float]:

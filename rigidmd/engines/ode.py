@@ -263,10 +263,9 @@ class OdeEngine(Engine):
             if is_singular(form, running.y, running.y, 0.0):
                 raise SingularError(running.y[1], running.t)
             if problem or not np.isfinite(running.y).all():
-                raise SimulationError(
-                    f"at t = {running.t:.6g}: {solver.name} finds no step that keeps its tolerances "
-                    f"({solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute)"
-                )
+                limits = f"{solver.relative_tolerance:g} relative, {solver.absolute_tolerance:g} absolute"
+                problem = f"{solver.name} finds no step that keeps its tolerances ({limits})"
+                raise SimulationError(f"at t = {running.t:.6g}: {problem}")
             self._dense_output = running.dense_output()
             if self.stop_requested():  # restore the last observation: the rates have changed the state
                 state.extra_variables[:] = kept

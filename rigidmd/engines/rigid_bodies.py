@@ -52,12 +52,9 @@ class RigidBodies:
             spin[self._inertia == 0] = 0.0
         held = self._frozen[:, None]
         return before._replace(
-            position=np.where(held, before.position, centre),
-            velocity=np.where(held, before.velocity, drift),
-            rotation=np.ascontiguousarray(rotation),
-            angular_momentum_body=spin,
-            cell=np.ascontiguousarray(cell),
-        )
+            position=np.where(held, before.position, centre), velocity=np.where(held, before.velocity, drift),
+            rotation=np.ascontiguousarray(rotation), angular_momentum_body=spin, cell=np.ascontiguousarray(cell),
+        )  # fmt: skip
 
     def points(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (s, 3) of the sites, lab frame."""

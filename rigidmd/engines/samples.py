@@ -70,7 +70,6 @@ COLUMNS: dict[str, Column] = {name: get_args(_HINTS[name])[1] for name in Sample
 
 
 def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
-    """The columns of the energies of user-defined forces."""
     return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
 
 
@@ -78,8 +77,6 @@ NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 
 class Family(NamedTuple):
-    """Columns of a body that are the components of one quantity."""
-
     names: tuple[str, ...]
     unit: str
     about: str

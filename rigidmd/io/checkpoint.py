@@ -75,10 +75,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path}: is damaged, or not a checkpoint: {error}") from None
     if schema != SCHEMA:
         age = "a later" if schema > SCHEMA else "an earlier"
-        raise CheckpointError(
-            f"{path}: was written by {age} rigidmd (version {schema} of the format; this one reads version {SCHEMA}): "
-            "finish the run with that one, or begin it again with --force"
-        )
+        problem = f"was written by {age} rigidmd (version {schema} of the format; this one reads version {SCHEMA})"
+        raise CheckpointError(f"{path}: {problem}: finish the run with that one, or begin it again with --force")
     return Checkpoint(values, arrays)
 
 

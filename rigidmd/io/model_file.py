@@ -21,7 +21,6 @@ def write_model(path: Path, model: MoleculeFile) -> None:
 
 
 def model_text(model: MoleculeFile) -> str:
-    """A model as TOML."""
     idle = all(site.charge_e is None and site.sigma_A is None and not site.parameters for site in model.sites)
     head = [f"{key} = {_text(value)}" for key in ("name", "title", "source", "note") if (value := getattr(model, key))]
     if model.residue_names:

@@ -13,7 +13,6 @@ PAUSE = 30.0
 
 
 def in_notebook() -> bool:
-    """Whether this is the kernel of a notebook."""
     ipython = sys.modules.get("IPython")
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
@@ -30,7 +29,6 @@ class DisplayArea:
         self._handle: Any = None
 
     def show(self, bundle: dict[str, Any], metadata: dict[str, Any] | None = None) -> None:
-        """Show a content, given by MIME type."""
         if self._handle is None:
             from IPython.display import DisplayHandle
 
@@ -75,7 +73,6 @@ class Bar(tqdm):
         self.start_t = self.last_print_t = self._marked = clock.monotonic()
 
     def skip(self, amount: float) -> None:
-        """Count an amount that was done earlier."""
         self.n += amount
         self.initial += amount
 

@@ -80,12 +80,9 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
         first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
             raise OutputError(f"{path} cannot be read: {first['msg']}{remedy}") from None
-        fault = (
-            validation_messages(error, BaseModel)[0]
-            if first["loc"]
-            else f"is {shorten_repr(first['input'])}, must be a table"
-        )
-        raise OutputError(f"{path}: {fault}{remedy}") from None
+        message = f"is {shorten_repr(first['input'])}, must be a table"
+        message = validation_messages(error, BaseModel)[0] if first["loc"] else message
+        raise OutputError(f"{path}: {message}{remedy}") from None
     except OSError as error:
         raise OutputError(f"{path} cannot be read: {error.strerror}") from None
 
@@ -99,10 +96,9 @@ def _is_there(path: Path, largest: float) -> bool:
     """Whether a file exists. Raises OutputError for a folder or device, and for a file larger than `largest`."""
     if not path.exists() and not path.is_symlink():
         return False
-    if fault := unreadable_reason(path, largest):
-        raise OutputError(
-            f"{path} cannot be read: it {fault}" if fault.startswith(("is", "has")) else f"{path}: {fault}"
-        )
+    if reason := unreadable_reason(path, largest):
+        is_clause = reason.startswith(("is", "has"))
+        raise OutputError(f"{path} cannot be read: it {reason}" if is_clause else f"{path}: {reason}")
     return True
 
 

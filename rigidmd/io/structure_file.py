@@ -146,11 +146,6 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
     return frames[frame - 1 if frame > 0 else frame]
 
 
-def _masses(atoms, suffix: str) -> np.ndarray | None:
-    """The masses in ASE's trajectories, if they are not its standard ones."""
-    return atoms.get_masses() if suffix == ASE_TRAJECTORY and atoms.has("masses") else None
-
-
 def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -> list[Callable[[], Atoms]]:
     """For each structure of a file, a function that reads it."""
     content = _content(path) if held is None else held
@@ -172,7 +167,9 @@ def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -
             source = Path(folder) / name.name
             source.write_bytes(text.encode() if wide else content.removeprefix(codecs.BOM_UTF8))
         found = read_by_ase(path, source)
-    return [partial(from_ase, path, atoms, masses=_masses(atoms, suffix)) for atoms in found]
+    # the masses in ASE's trajectories, if they are not its standard ones
+    masses = [atoms.get_masses() if suffix == ASE_TRAJECTORY and atoms.has("masses") else None for atoms in found]
+    return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
 
 
 def _content(path: Path) -> bytes:

@@ -60,7 +60,6 @@ def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True
 def set_frame(
     u: mda.Universe, system: System | BodySystem, state: State, time: float, step: int, velocities: bool, wrapped: bool
 ):
-    """Set the universe's present frame to a state."""
     frame = u.trajectory.ts
     frame.positions = system.site_positions(state, wrapped)
     if velocities:
@@ -102,8 +101,6 @@ def _checked(times: list[float]) -> list[float]:
 
 
 class Frames(NamedTuple):
-    """Evenly spaced frames of a trajectory."""
-
     time: np.ndarray  # (f,) ps
     positions: np.ndarray  # (f, s, 3) Å
     cells: np.ndarray | None  # (f, 3, 3); None without a box

@@ -60,10 +60,8 @@ def _check_fits(path: Path, positions: np.ndarray) -> None:
     least, largest = LIMITS.get(path.suffix, (-inf, inf))
     for bound, beyond in ((least, positions.min() < least), (largest, positions.max() > largest)):
         if beyond:
-            raise SimulationError(
-                f"a position is beyond the {bound:g} Å that {path.suffix} can hold: use .trr or .nc, "
-                "output.positions = 'wrapped', or of a body less output.trajectory_A_per_m"
-            )
+            hint = "use .trr or .nc, output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
+            raise SimulationError(f"a position is beyond the {bound:g} Å that {path.suffix} can hold: {hint}")
 
 
 class TrajectoryFile:
@@ -89,12 +87,9 @@ class TrajectoryFile:
         self._path, self._format, self._system = path, path.suffix, system
         self._velocities, self._wrapped = velocities, wrapped
         self._universe = universe(system, system.state, velocities)
-        forms = {
-            ".dcd": {"dt": interval},
-            ".nc": {"velocities": velocities},
-            ".pdb": {"multiframe": True, "bonds": None},  # bonds are in the topology
-        }
-        self._options = forms.get(path.suffix, {})
+        pdb = {"multiframe": True, "bonds": None}  # bonds are in the topology
+        options = {".dcd": {"dt": interval}, ".nc": {"velocities": velocities}, ".pdb": pdb}
+        self._options = options.get(path.suffix, {})
         *before, self._frames = kept or (0, 0, 0)
         offset, form = COUNTER.get(path.suffix, (0, ""))
         patched = (offset, struct.pack(form, 1)) if form else (0, b"")

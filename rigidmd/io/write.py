@@ -73,8 +73,6 @@ def nine_digits(value: float | None) -> float | None:
 def columns_text(lines: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
     """Lines of cells as a table. The columns with indices `left` are aligned left, all others right."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = [
-        [cell.ljust(w) if k in left else cell.rjust(w) for k, (cell, w) in enumerate(zip(line, widths, strict=True))]
-        for line in lines
-    ]
+    align = [str.ljust if k in left else str.rjust for k in range(len(widths))]
+    padded = [[a(cell, w) for a, cell, w in zip(align, line, widths, strict=True)] for line in lines]
     return "\n".join("  ".join(line).rstrip() for line in padded)

@@ -38,7 +38,6 @@ SEEDS = 2**31 - 1
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """Descriptions of the features of a scene that GROMACS lacks."""
     system = view.system
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
     if not view.is_periodic or system.cutoff == inf:
@@ -46,20 +45,15 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
     if view.lennard_jones is not None and view.truncation not in MODIFIERS:
         found.append(f"forces.truncation = {view.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
     if view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift"):
-        found.append(
-            f"forces.truncation = {view.truncation!r} with reaction_field: GROMACS has plain and shift for it; "
-            "use one of them, or pme"
-        )
+        hint = "GROMACS has plain and shift for it; use one of them, or pme"
+        found.append(f"forces.truncation = {view.truncation!r} with reaction_field: {hint}")
     if view.electrostatics in ("ewald", "damped_shifted_force"):
         found.append(f"forces.electrostatics = {view.electrostatics!r}: GROMACS has pme and reaction_field")
     if view.frozen.any():
         found.append("frozen molecules: GROMACS would compute forces between them")
     shapes = [_body(m) for m in system.species]
-    found += [
-        f"{m.name}: GROMACS has no rigid bodies of this shape, whose mass is neither on a line nor in a plane"
-        for m, body in zip(system.species, shapes, strict=True)
-        if len(body.mass) > 3
-    ]
+    solid = [m.name for m, body in zip(system.species, shapes, strict=True) if len(body.mass) > 3]
+    found += [f"{name}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane" for name in solid]
     if sum(len(body.mass) == 3 for body in shapes) > 1:
         found.append("several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle")
     for k, stage in enumerate(system.scene.stages):
@@ -104,11 +98,10 @@ def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
     text = {
-        COORDINATES: _coordinates(view, bodies, state),
-        TOPOLOGY: _topology(view, bodies),
+        COORDINATES: _coordinates(view, bodies, state), TOPOLOGY: _topology(view, bodies),
         **{f"{name}.mdp": _settings(view, k) for name, (k, _) in zip(names, stages, strict=True)},
         SCRIPT: _script(names),
-    }
+    }  # fmt: skip
     for name, content in text.items():
         write_text(folder / name, content)
     (folder / SCRIPT).chmod(0o755)
@@ -141,7 +134,7 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
         gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
         gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
-    more, more_velocity = _points_at(view, extra, state)
+    more, more_velocity = RigidBodies(system, extra).points(state) if len(extra.mass) else np.zeros((2, 0, 3))
     width = DECIMALS + 5
     rows, s, e = [], 0, 0
     for n, k in enumerate(species):
@@ -160,12 +153,6 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
     box = [a[0], b[1], c[2]] + ([a[1], a[2], b[0], b[2], c[0], c[1]] if is_tilted else [])
     last = " ".join(f"{value:.{DECIMALS}f}" for value in box)
     return "\n".join([f"{system.scene.name}, written by rigidmd", str(len(rows)), *rows, last]) + "\n"
-
-
-def _points_at(view: ForceFieldView, points: Points, state: State) -> tuple[np.ndarray, np.ndarray]:
-    if not len(points.mass):
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    return RigidBodies(view.system, points).points(state)
 
 
 def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
@@ -201,7 +188,6 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
 
 
 def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
-    """A moleculetype."""
     count, charges = len(m.masses), m.charges if view.coulomb is not None else np.zeros(len(m.masses))
     extra = np.cumsum(body.site < 0) - 1
     where = np.where(body.site >= 0, body.site, count + extra)
@@ -235,7 +221,6 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
 
 
 def _settings(view: ForceFieldView, k: int) -> str:
-    """The .mdp file of stage k."""
     system = view.system
     scene, stage = system.scene, system.scene.stages[k]
     cutoff = system.cutoff * NM
@@ -246,28 +231,15 @@ def _settings(view: ForceFieldView, k: int) -> str:
     keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
     interval = system.removes_momentum_every
     found: dict[str, object] = {
-        "integrator": _integrator(stage),
-        "dt": f"{stage.timestep_fs * 1e-3:.12g}",
-        "nsteps": stage.steps,
-        "comm-mode": "Linear" if keeps else "None",
-        "nstcomm": every(interval) if interval else 100,
-        "nstlog": every(scene.output.log_interval_ps),
-        "nstenergy": every(scene.output.log_interval_ps),
+        "integrator": _integrator(stage), "dt": f"{stage.timestep_fs * 1e-3:.12g}", "nsteps": stage.steps,
+        "comm-mode": "Linear" if keeps else "None", "nstcomm": every(interval) if interval else 100,
+        "nstlog": every(scene.output.log_interval_ps), "nstenergy": every(scene.output.log_interval_ps),
         "nstxout-compressed": every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0,
-        "continuation": "yes",
-        "gen-vel": "no",
-        "cutoff-scheme": "Verlet",
-        "pbc": "xyz",
-        "rlist": f"{cutoff:.12g}",
-        "rvdw": f"{cutoff:.12g}",
-        "rcoulomb": f"{cutoff:.12g}",
-        "vdwtype": "Cut-off",
-        "constraint-algorithm": "lincs",
-        "lincs-order": 8,
-        "lincs-iter": 4,
-        "DispCorr": "AllEnerPres" if system.tail is not None else "no",
+        "continuation": "yes", "gen-vel": "no", "cutoff-scheme": "Verlet", "pbc": "xyz", "rlist": f"{cutoff:.12g}",
+        "rvdw": f"{cutoff:.12g}", "rcoulomb": f"{cutoff:.12g}", "vdwtype": "Cut-off", "constraint-algorithm": "lincs",
+        "lincs-order": 8, "lincs-iter": 4, "DispCorr": "AllEnerPres" if system.tail is not None else "no",
         "ld-seed": (scene.seed * 1000 + k) % SEEDS,
-    }
+    }  # fmt: skip
     if view.lennard_jones is not None:
         found["vdw-modifier"] = MODIFIERS[view.truncation]
         if "switch" in view.truncation:
@@ -286,12 +258,10 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
     law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
         return {
-            "coulombtype": "PME",
-            "coulomb-modifier": "Potential-shift" if law.shift else "None",
+            "coulombtype": "PME", "coulomb-modifier": "Potential-shift" if law.shift else "None",
             "ewald-rtol": f"{float(erfc(law.alpha * law.cutoff)):.12g}",
-            **{f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)},
-            "pme-order": mesh.order,
-        }
+            **{f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)}, "pme-order": mesh.order,
+        }  # fmt: skip
     if isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
         return {"coulombtype": "Reaction-Field", "epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
@@ -299,18 +269,15 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
 
 
 def _couplings(stage: Stage) -> dict[str, object]:
-    """Thermostat and barostat."""
     found: dict[str, object] = {"tcoupl": "no", "pcoupl": "no"}
     if not stage.has_thermostat:
         return found
     first, last = stage.temperatures
     coupling = {"nose_hoover": "nose-hoover", "velocity_rescaling": "v-rescale", "langevin": "no"}
     found |= {
-        "tcoupl": coupling[stage.thermostat_kind],
-        "tc-grps": "System",
-        "ref-t": f"{first:.12g}",
+        "tcoupl": coupling[stage.thermostat_kind], "tc-grps": "System", "ref-t": f"{first:.12g}",
         "tau-t": f"{stage.thermostat_time:.12g}",
-    }
+    }  # fmt: skip
     if stage.thermostat_kind == "nose_hoover":
         found["nh-chain-length"] = stage.nose_hoover_links
     if first != last:
@@ -319,10 +286,9 @@ def _couplings(stage: Stage) -> dict[str, object]:
     if stage.has_barostat:
         pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
         found |= {
-            "pcoupl": "C-rescale",
-            "pcoupltype": "isotropic" if count == 1 else "semiisotropic",
+            "pcoupl": "C-rescale", "pcoupltype": "isotropic" if count == 1 else "semiisotropic",
             "tau-p": f"{stage.barostat_time:.12g}",
             "ref-p": " ".join(f"{value:.12g}" for value in (pressure[0], pressure[2])[:count]),
             "compressibility": " ".join([f"{stage.compressibility:.12g}"] * count),
-        }
+        }  # fmt: skip
     return found

@@ -75,10 +75,8 @@ class LammpsEngine(ExternalEngine):
         date, there = self._process.run_commands(f'print "{NUMBERS} $(version) $(extract_setting(world_size))"')
         if there != ranks:
             self.close()
-            raise EngineError(
-                f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to another MPI; "
-                "put the mpirun of LAMMPS on the PATH, or use 1 rank"
-            )
+            problem = f"LAMMPS has {there:.0f} ranks instead of {ranks}: the launcher belongs to another MPI"
+            raise EngineError(f"{problem}; put the mpirun of LAMMPS on the PATH, or use 1 rank")
         self.version = f"LAMMPS {date:.0f}"
 
     def _run(self, state: State, steps: int, dt: float) -> None:
@@ -108,12 +106,8 @@ class LammpsEngine(ExternalEngine):
             return None
         inverse = model.rotor.inverse_inertia
         largest_first = np.argsort(-model.inertia, axis=1, kind="stable")
-        return model.rotor._replace(
-            symmetry=np.full(len(inverse), NO_SYMMETRY),
-            common=np.zeros(len(inverse)),
-            excess=inverse.copy(),
-            order=largest_first,
-        )
+        none, zero = np.full(len(inverse), NO_SYMMETRY), np.zeros(len(inverse))
+        return model.rotor._replace(symmetry=none, common=zero, excess=inverse.copy(), order=largest_first)
 
     def close(self) -> None:
         self._process.close()
@@ -210,15 +204,11 @@ class Process:
         self._output: list[str] = []
         try:
             self._process = subprocess.Popen(
-                [*arguments, "-nonbuf", "-nocite", "-log", "none"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                cwd=self.folder,
-                text=True,
-                start_new_session=True,  # Ctrl-C is for this program, which ends it
+                [*arguments, "-nonbuf", "-nocite", "-log", "none"], cwd=self.folder, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is for this program, which ends LAMMPS
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
-            )
+            )  # fmt: skip
         except OSError as error:
             raise EngineError(f"LAMMPS cannot be started as {' '.join(arguments)}: {error.strerror}") from None
         self._in, self._out = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)

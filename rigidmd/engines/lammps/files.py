@@ -36,18 +36,12 @@ DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "
 BODIES, POINTS, FROZEN = "bodies", "points", "frozen"
 #: Lennard-Jones styles by truncation.
 STYLES = {
-    "plain": "lj/cut",
-    "shift": "lj/cut",
-    "force_shift": "lj/smooth/linear",
-    "force_switch": "lj/gromacs",
-    "switch": "lj/mdf",
-    "smooth_switch": "table",
-}
+    "plain": "lj/cut", "shift": "lj/cut", "force_shift": "lj/smooth/linear", "force_switch": "lj/gromacs",
+    "switch": "lj/mdf", "smooth_switch": "table",
+}  # fmt: skip
 
 
 class PairStyle(NamedTuple):
-    """A pair style, its arguments and its coefficients."""
-
     name: str
     arguments: str
     coefficients: dict[tuple[int, int], str]  # kinds from 0, the smaller one first
@@ -56,7 +50,6 @@ class PairStyle(NamedTuple):
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """Descriptions of the features of a scene that LAMMPS lacks."""
     scene = view.system.scene
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(view.system)]
     if view.has_ewald_sum and scene.forces.ewald_truncation == "shift":
@@ -180,7 +173,6 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def pair_styles(view: ForceFieldView) -> list[PairStyle]:
-    """The pair styles for the pair potentials of a system."""
     return [style for style in (_lennard_jones(view), _coulomb(view)) if style is not None]
 
 
@@ -280,10 +272,8 @@ def _of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> li
     if stage.is_minimisation or stage.ensemble == "nve":
         return [f"fix {POINTS} {POINTS} nve"]
     if stage.thermostat_kind == "langevin":
-        return [
-            f"fix {POINTS} {POINTS} nve",
-            f"fix {POINTS}_bath {POINTS} langevin {_langevin(stage, seed + 1)} tally yes",
-        ]
+        langevin = f"fix {POINTS}_bath {POINTS} langevin {_langevin(stage, seed + 1)} tally yes"
+        return [f"fix {POINTS} {POINTS} nve", langevin]
     if stage.has_barostat:
         kind = "npt" if stage.has_thermostat else "nph"
         thermostat = f"{_chain(stage)} " if stage.has_thermostat else ""
@@ -315,7 +305,6 @@ def _box(view: ForceFieldView, stage: Stage) -> str:
 
 
 def _thermo(view: ForceFieldView) -> list[str]:
-    """Columns of the log."""
     columns = "step time temp pe ke etotal press vol density"
     constant = view.system.constants.get("coulomb_intramolecular")
     if constant is None:
@@ -330,15 +319,9 @@ def _thermo(view: ForceFieldView) -> list[str]:
 def input_script(view: ForceFieldView) -> str:
     """The input script of the whole run: settings, and all stages except minimisations."""
     system, output = view.system, view.system.scene.output
-    lines = [
-        f"# {in_comment(system.scene.in_short)}",
-        "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps",
-        "",
-        f"include {SETTINGS}",
-        "",
-        *_thermo(view),
-        "thermo_modify format float %.10g flush yes",
-    ]
+    hint = "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
+    lines = [f"# {in_comment(system.scene.in_short)}", hint, "", f"include {SETTINGS}", ""]
+    lines += [*_thermo(view), "thermo_modify format float %.10g flush yes"]
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation:
             continue

@@ -15,7 +15,7 @@ from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.observables import kinetic_energies
-from rigidmd.engines.openmm.stages import extra_forces, integration_groups, integrator_of, step, tolerance
+from rigidmd.engines.openmm.stages import TOLERANCES, extra_forces, integration_groups, integrator_of, step
 from rigidmd.engines.openmm.system import NM, Group, Layout, layout, library, openmm_system
 from rigidmd.engines.protocol import Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
@@ -89,7 +89,7 @@ class OpenmmEngine(ExternalEngine):
         self._model = particle_model(view)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
-        self._integrator = integrator_of(view, stage, tolerance(platform, properties))
+        self._integrator = integrator_of(view, stage, TOLERANCES[properties.get("Precision", "double")])
         rest = mm.VerletIntegrator(0.001)
         try:
             evaluated, moved = (self._model.made(system.state, separate) for separate in (True, False))

@@ -93,10 +93,8 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
     context.setPositions(position)
     context.setVelocities(velocity)
-    text = {
-        SYSTEM: mm.XmlSerializer.serialize(made),
-        STATE: mm.XmlSerializer.serialize(context.getState(positions=True, velocities=True)),
-    }
+    serialize = mm.XmlSerializer.serialize
+    text = {SYSTEM: serialize(made), STATE: serialize(context.getState(positions=True, velocities=True))}
     rows = []
     scene = view.system.scene
     for k, stage in enumerate(scene.stages):
@@ -104,15 +102,13 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
             continue
         number = f"_{len(rows) + 1}" if rows else ""
         file = f"integrator{number}.xml"
-        text[file] = mm.XmlSerializer.serialize(integrator_of(view, k, TOLERANCES["mixed"]))
+        text[file] = serialize(integrator_of(view, k, TOLERANCES["mixed"]))
         others = []
         for n, other in enumerate(extra_forces(view, k)):
             others.append(f"besides{number}_{n + 1}.xml")
-            text[others[-1]] = mm.XmlSerializer.serialize(other)
-        every, frame = (
-            max(1, round(interval * 1e3 / stage.timestep_fs))
-            for interval in (scene.output.log_interval_ps, scene.output.trajectory_interval_ps)
-        )
+            text[others[-1]] = serialize(other)
+        intervals = (scene.output.log_interval_ps, scene.output.trajectory_interval_ps)
+        every, frame = (max(1, round(interval * 1e3 / stage.timestep_fs)) for interval in intervals)
         rows.append(f"    {(stage.label, stage.steps, every, frame, file, others)!r},")
     names = {"system": SYSTEM, "state": STATE, "topology": TOPOLOGY, "kick": KICK, "moves": MOVES}
     values = {"title": in_comment(scene.in_short), "stages": "\n".join(rows), **names}
@@ -120,7 +116,9 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     for name, content in text.items():
         write_text(folder / name, content)
     with atomic_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        _write_pdb(file, _topology(model), position)
+        from openmm import Vec3, app
+
+        app.PDBFile.writeFile(_topology(model), [Vec3(*row) for row in (position / NM).tolist()], file)  # Å
     return [*text, TOPOLOGY]
 
 
@@ -141,9 +139,3 @@ def _topology(model: ParticleModel) -> "Topology":
             symbol = m.elements[j] if is_site else "X"
             made.addAtom(name, None if symbol == "X" else app.Element.getBySymbol(symbol), residue)
     return made
-
-
-def _write_pdb(file, topology: "Topology", position) -> None:
-    from openmm import Vec3, app
-
-    app.PDBFile.writeFile(topology, [Vec3(*row) for row in (position / NM).tolist()], file)  # Å

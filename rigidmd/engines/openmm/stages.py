@@ -13,13 +13,8 @@ KICK, MOVES = "kick", "moves"
 SEEDS = 2**31 - 1
 #: Interval, in steps, of a removal of momentum that never happens.
 NEVER = 2**31 - 1
-#: Relative tolerance of constrained distances by precision.
+#: Relative tolerance of constrained distances by precision, which is double on the platforms Reference and CPU.
 TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
-
-
-def tolerance(platform: str, properties: dict[str, str]) -> float:
-    """Relative tolerance of constrained distances. The platforms Reference and CPU use double precision."""
-    return TOLERANCES[properties.get("Precision", "double")]
 
 
 def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> Any:

@@ -55,14 +55,11 @@ def library() -> Any:
 
 
 def unsupported_features(view: ForceFieldView) -> list[str]:
-    """Descriptions of the features of a scene that OpenMM lacks."""
     system, forces = view.system, view.system.scene.forces
     found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
     if view.has_ewald_sum and grid_for(view, PME_ORDER) is None:
-        found.append(
-            f"forces.electrostatics = {forces.electrostatics!r}: no grid for OpenMM's splines, of order {PME_ORDER}, "
-            "reaches the requested accuracy; request a lower one"
-        )
+        problem = f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy"
+        found.append(f"forces.electrostatics = {forces.electrostatics!r}: {problem}; request a lower one")
     for k, stage in enumerate(system.scene.stages):
         found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
     if view.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
@@ -150,15 +147,10 @@ def layout(view: ForceFieldView) -> Layout:
         gather_per_molecule([body.mass for body in bodies], species),
     )
     return Layout(
-        gather_per_molecule(mass, species),
-        np.repeat(np.arange(len(species)), count),
-        np.repeat(first, sites) + within,
-        np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),
-        points,
-        bodies,
-        first,
-        local,
-    )
+        gather_per_molecule(mass, species), np.repeat(np.arange(len(species)), count),
+        np.repeat(first, sites) + within, np.concatenate([first[i] + local[k] for i, k in enumerate(species)]), points,
+        bodies, first, local,
+    )  # fmt: skip
 
 
 def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
@@ -207,7 +199,6 @@ def _openmm_virtual_site(mm: Any, points: list[int], weight: list[float], cross:
 
 
 def _forces(mm: Any, view: ForceFieldView, particles: Layout, separate: bool) -> list[tuple]:
-    """Pairs of a force and its group."""
     found, law, coulomb = [], view.lennard_jones, view.coulomb
     plain = _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)

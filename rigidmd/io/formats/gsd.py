@@ -280,10 +280,10 @@ class GsdFile(FrameFile):
                 return name
             return f"{species}.{name if len(of_species[species, name]) == 1 else site}"
 
-        labels = [
-            np.array([label(m.name, *both) for both in zip(of_sites, m.site_names, strict=True)], dtype=object)
-            for m, of_sites in zip(self._system.species, names, strict=True)
-        ]
+        labels = []
+        for m, of_sites in zip(self._system.species, names, strict=True):
+            pairs = zip(of_sites, m.site_names, strict=True)
+            labels.append(np.array([label(m.name, *pair) for pair in pairs], dtype=object))
         return gather_per_molecule(labels, self._system.model.species)
 
     def _frame(self, state: State, time: float, step: int) -> Any:

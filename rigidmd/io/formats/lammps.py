@@ -42,8 +42,6 @@ COORDINATES = (("x", "y", "z"), ("xs", "ys", "zs"), ("xu", "yu", "zu"), ("xsu", 
 
 
 class Row(NamedTuple):
-    """A line of a section."""
-
     line: int
     words: list[str]
     comment: str
@@ -224,13 +222,10 @@ def _in_our_units(found: Atoms, velocity: np.ndarray | None, title: str, unknown
 
 
 def read_dump(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
-    """The frames of a text dump (`dump custom` or `dump atom`)."""
     units = next((lines[k + 1].strip() for k, line in enumerate(lines[:-1]) if line.startswith("ITEM: UNITS")), "")
     starts = [k for k, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
-    return [
-        partial(_dump_frame, path, lines[first:last], first, units, atom_types)
-        for first, last in pairwise([*starts, len(lines)])
-    ]
+    parts = pairwise([*starts, len(lines)])
+    return [partial(_dump_frame, path, lines[first:last], first, units, atom_types) for first, last in parts]
 
 
 def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types) -> Atoms:
@@ -291,7 +286,6 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
 
 
 def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
-    """The origin (3,) and the cell (3, 3) of a dump."""
     bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
         raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))

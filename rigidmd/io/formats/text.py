@@ -63,7 +63,6 @@ def cell_of(edges_and_angles: list[float]) -> np.ndarray | None:
 
 
 def required_cell(path: Path, edges_and_angles: list[float]) -> np.ndarray:
-    """`cell_of` edges and angles. Raises StructureError if no cell has them."""
     if (cell := cell_of(edges_and_angles)) is not None:
         return cell
     values = " ".join(f"{x:g}" for x in edges_and_angles)
