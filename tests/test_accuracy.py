@@ -124,7 +124,7 @@ def clockwork(monkeypatch):
 
 
 @pytest.mark.parametrize("steps", [1, 25, 1000])
-@pytest.mark.parametrize("goes_on", [False, True])
+@pytest.mark.parametrize("can_continue", [False, True])
 def test_a_timing_is_of_warm_steps_and_of_nothing_else(clockwork, steps, can_continue):
     """25 steps of 216 waters took 40 ms where a new engine began with them, and 20 ms after that."""
     trial_system, made = clockwork(can_continue)
@@ -644,7 +644,7 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
     assert "--averages samples the last stage, and nve has no thermostat" in said
     assert len([line for line in said.splitlines() if "averages" in line]) == 1
     assert main(["accuracy", water, "--sample-ps", "3"]) == 2
-    assert "it goes with --averages" in capsys.readouterr().err
+    assert "it needs --averages without a PS" in capsys.readouterr().err
     with pytest.raises(SceneError, match="a single body has no thermostat"):
         measure_averages(Scene.read(TOP))
     with pytest.raises(SceneError, match="one temperature and one pressure"):

@@ -86,7 +86,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert set(found) == set(registry.ORDER)
     left_out = [name for name, entry in found.items() if not entry["curves"] and not entry["values"]]
     assert left_out == ["viscosity"]
-    assert "viscosity: left out: a viscosity needs 20 ps of the pressure tensor at least; there are 0.2 ps" in text
+    assert "viscosity: skipped: a viscosity needs 20 ps of the pressure tensor at least; there are 0.2 ps" in text
     files = [name for entry in found.values() for name in entry["files"]]
     assert sorted([*before, "analysis.json", *files]) == names(copy)
     assert set(files) <= set((copy / ".rigidmd-run").read_text().split("\n"))  # which a new run removes

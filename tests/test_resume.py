@@ -160,7 +160,7 @@ def again(stopped, tmp_path):
 def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     folder = str(again / "run")
     assert cli.main(["resume", folder]) == 0
-    assert read_checkpoint(again / "run" / CHECKPOINT).told["place"]["first"] == 0
+    assert read_checkpoint(again / "run" / CHECKPOINT).values["place"]["first"] == 0
     assert cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"]) == 0
     steps = [int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]]
     assert steps == list(range(0, 121, 10))
@@ -228,7 +228,7 @@ def test_the_summary_tells_what_a_run_was_made_with(stopped):
 
 def test_another_version_is_told(again, capsys):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
-    kept.told["with"]["numba_version"] = "0.1"
+    kept.values["with"]["numba_version"] = "0.1"
     write_checkpoint(again / "run", kept)
     assert cli.main(["resume", str(again / "run")]) == 0
     assert "computed with numba 0.1 there, " in capsys.readouterr().err
@@ -243,7 +243,7 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
     results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
     assert results.summary["input_sha256"] == {"structure.file": digest}
-    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).told["run"]["inputs"] == {"structure.file": digest}
+    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).values["run"]["inputs"] == {"structure.file": digest}
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):
@@ -517,7 +517,7 @@ class Counting(Every):
         return Checkpoint({"counted": self.counted}, {"squares": np.arange(self.counted) ** 2})
 
     def resume(self, run, kept) -> None:
-        self.counted = kept.told["counted"]
+        self.counted = kept.values["counted"]
         assert len(kept.arrays["squares"]) == self.counted
 
 
@@ -540,7 +540,7 @@ def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
 def test_a_checkpoint_of_another_version_is_refused(again, capsys):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
     for schema, age in ((1, "an earlier"), (99, "a later")):
-        told = np.frombuffer(json.dumps(kept.told | {"schema": schema}).encode(), np.uint8)
+        told = np.frombuffer(json.dumps(kept.values | {"schema": schema}).encode(), np.uint8)
         for name in (CHECKPOINT, PREVIOUS):
             with zipfile.ZipFile(again / "run" / name, "w") as archive:
                 for member, array in {"told": told, **kept.arrays}.items():
@@ -585,15 +585,15 @@ def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
     found = []
     for name, array in kept.arrays.items():
         for kind, other in altered(array).items():
-            found.append((f"{name}: {kind}", Checkpoint(kept.told, kept.arrays | {name: other})))
-        found.append((f"{name}: left out", Checkpoint(kept.told, {k: a for k, a in kept.arrays.items() if k != name})))
-    for path in leaves(kept.told)[1:]:
+            found.append((f"{name}: {kind}", Checkpoint(kept.values, kept.arrays | {name: other})))
+        found.append((f"{name}: left out", Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name})))
+    for path in leaves(kept.values)[1:]:
         *way, last = path
-        whole = functools.reduce(lambda part, key: part[key], way, kept.told)[last]
+        whole = functools.reduce(lambda part, key: part[key], way, kept.values)[last]
         others = [None, "x", [], {}, [None], -1.5, float("nan"), float("inf"), 10**30, -(10**30), 40, 7, -1]
         others += [whole + 1, -whole, whole + 0.5] if isinstance(whole, int | float) else []
         for other in others:
-            told = copy.deepcopy(kept.told)
+            told = copy.deepcopy(kept.values)
             functools.reduce(lambda part, key: part[key], way, told)[last] = other
             if other != whole:
                 found.append((f"{'.'.join(map(str, path))}: {other!r:.20}", Checkpoint(told, kept.arrays)))
@@ -702,7 +702,7 @@ def test_every_flipped_bit_of_a_checkpoint_is_seen(again):
         except CheckpointError:
             continue
         # bits of the archive that mean nothing, such as times
-        assert found.told == kept.told
+        assert found.told == kept.values
         assert all(np.array_equal(found.arrays[name], array) for name, array in kept.arrays.items())
 
 
@@ -750,7 +750,7 @@ def test_a_run_stops_before_its_wall_time_is_up(stopped, tmp_path, capsys, monke
         with monkeypatch.context() as patch:
             patch.setattr(time, "monotonic", read)
             assert cli.main([*command, *more, "--walltime", "0:00:04"]) == 75
-        assert "goes on with it" in capsys.readouterr().out
+        assert "continues it" in capsys.readouterr().out
         assert 4.0 - spare - 0.1 < now[0] - began < 4.0
         log = (tmp_path / "run" / "log.csv").read_text().splitlines()
         steps = [int(line.split(",")[0]) for line in log[1:-1]]

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from support import (
     ROOT,
+    AnalysisResult,
     Axis,
     Curve,
-    AnalysisResult,
     FolderLock,
     Pool,
     SweepRow,
@@ -436,7 +436,7 @@ def test_a_wall_time_that_is_over_leaves_the_rest(argon, tmp_path, capsys):
                  "output.trajectory=false", "--set", "output.log_interval_ps=100", "-o", str(folder)]  # fmt: skip
     assert cli.main([*arguments, "--walltime", "0:00:03"]) == 75
     assert set(states(folder).values()) <= {"interrupted", "waiting"}
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "the same command continues" in capsys.readouterr().out
 
 
 def test_two_sweeps_do_not_share_a_folder(copied, argon, capsys):
@@ -636,7 +636,7 @@ def test_words_for_slurm():
         (["--set", "seed=1..1000", "--set", "start.temperature_K=1..1000"], "these are 1000000 points"),
         (["--replicas", "3", "--set", "seed=1..3"], "leave out one of them"),
         (["--set", "seed=1..3", "--to", "slurm"], "needs --walltime"),
-        (["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"], "do not go together"),
+        (["--set", "seed=1..3", "--to", "slurm", "--walltime", "1:00:00", "--collect"], "cannot be combined"),
         (["--set", "seed=1..3", "--trust", "nothing.py"], "there is no such file"),
     ],
 )  # fmt: skip
