@@ -22,8 +22,6 @@ from rigidmd.core.state import Load, State
 from rigidmd.engines.cpu import Engine
 from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
-from rigidmd.forces.ewald.direct_sum import EwaldWorkspace
-from rigidmd.forces.ewald.pme import PmeWorkspace
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
@@ -86,7 +84,7 @@ def site_forces(
             continue
         on_site = np.array(cast(Any, workspace).site_force)
         at = _site_indices(system, sites)
-        if isinstance(workspace, EwaldWorkspace | PmeWorkspace):
+        if name.endswith("reciprocal"):
             real = cast(PairForces, system.terms[name.replace("reciprocal", "real")])
             law = cast(ScreenedCoulomb, real.potential)
             position = (state.position[system.sites.molecule] + arm)[at]

@@ -1,7 +1,7 @@
 """Errors of the forces of a scene: of Ewald sums, estimated and measured, and of single precision between pairs."""
 
 from math import pi, sqrt
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from scipy.special import erf
@@ -11,13 +11,15 @@ from rigidmd.core.state import State
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
-from rigidmd.forces.ewald.direct_sum import EwaldSum, EwaldWorkspace
+from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.errors import charges_of, k_cutoff_of_count, k_space_error, pme_error, real_error
-from rigidmd.forces.ewald.pme import Pme, PmeWorkspace
-from rigidmd.forces.neighbors.pair_loop import PairForces, PairWorkspace
+from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB
+
+if TYPE_CHECKING:
+    from rigidmd.forces.ewald.pme import Pme  # needs rocket-fft, which is for scenes with PME
 
 #: Error of the reference sum, relative to the estimated error of the sum under test.
 REFERENCE_ERROR = 1e-3
@@ -36,7 +38,6 @@ class CoulombErrors(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """The measured error over the rms force."""
         return self.measured / self.force
 
 
@@ -58,18 +59,15 @@ def coulomb_errors(system: System, state: State) -> CoulombErrors:
     )
     tight = scene.model_copy(update={"forces": forces, "precision": "double"})
     reference = build(tight)
-    moves = mobile(system.model)[_real_part(system).sites.molecule]
+    moves = mobile(system.model)[cast(PairForces, system.terms["coulomb_real"]).sites.molecule]
     found, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((found - exact)[moves], axis=1)
     return CoulombErrors(
-        estimated=system.force_error,
-        measured=float(np.sqrt((error**2).mean())),
-        largest=float(error.max()),
-        force=float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())),
-        energy=energy - exact_energy,
+        estimated=system.force_error, measured=float(np.sqrt((error**2).mean())), largest=float(error.max()),
+        force=float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())), energy=energy - exact_energy,
         reference=next(note for note in reference.notes if note.startswith("ewald")),
-    )
+    )  # fmt: skip
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
@@ -81,11 +79,11 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     charges = charges_of(
         [(int(n), m.charges[c], m.positions_body[c]) for n, m, c in zip(counts, system.species, charged, strict=True)]
     )
-    if isinstance(term, Pme):
-        reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
-    else:
-        term = cast(EwaldSum, term)
+    if isinstance(term, EwaldSum):
         reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
+    else:
+        term = cast("Pme", term)
+        reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
     return float(np.hypot(real_error(charges, term.alpha, system.cutoff, volume), reciprocal)) * COULOMB
 
 
@@ -103,20 +101,14 @@ def single_precision_errors(system: System, state: State) -> tuple[float, float]
     return errors[0], errors[1]
 
 
-def _real_part(system: System) -> PairForces:
-    """The real-space term of an Ewald sum."""
-    return cast(PairForces, system.terms["coulomb_real"])
-
-
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     engine = system.engine_of(charged, system.scene.precision)
     _, tallies = engine.evaluate(state)
-    real, force = _real_part(system), np.zeros((system.site_count, 3))
-    for workspace in engine.workspaces.values():
-        if isinstance(workspace, (PairWorkspace, EwaldWorkspace, PmeWorkspace)):
-            force = force + workspace.site_force
+    real, force = cast(PairForces, system.terms["coulomb_real"]), np.zeros((system.site_count, 3))
+    for name in ("coulomb_real", "coulomb_reciprocal"):
+        force = force + cast(Any, engine.workspaces[name]).site_force
     position = np.empty_like(force)
     compute_site_positions(real.sites, state, position)
     law = cast(ScreenedCoulomb, real.potential)

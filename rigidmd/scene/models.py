@@ -7,7 +7,6 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
-from scipy.spatial import KDTree
 
 from rigidmd.core.toml import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
@@ -241,6 +240,8 @@ def molecule(
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
     frame = principal_frame(masses, positions, size)
     body = (positions - frame.centre) @ frame.axes
+    from scipy.spatial import KDTree  # slow to import
+
     near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
     faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
     if frame.kind == "linear" or (frame.kind == "point" and not faults):
