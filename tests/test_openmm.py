@@ -113,7 +113,7 @@ def test_energies_and_forces_on_bodies_of_a_cluster(counts):
     system, ours, state = built(counts | {"argon": 2}, None, seed=3, spread=0.2)
     theirs = OpenmmEngine(system, platform="Reference")
     agree(ours, theirs, state, 1e-10)
-    particles, (at, _) = theirs._model.particles, theirs._model.positions(state)
+    particles, (at, _) = theirs._particles, theirs._particles.positions(state)
     theirs._put(theirs._evaluating_context, state)
     theirs._evaluating_context.computeVirtualSites()
     virtual_sites = theirs._evaluating_context.getState(getPositions=True).getPositions(asNumpy=True)._value * 10

@@ -5,7 +5,7 @@ term by term, so that observations leave no trace in the motion. OpenMM has no v
 energies at scaled centres of mass.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,12 +13,10 @@ from rigidmd.core.state import HEAT, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
-from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm.stages import TOLERANCES, extra_forces, integration_groups, integrator_of, step
-from rigidmd.engines.openmm.system import NM, Group, Layout, layout, library, openmm_system
+from rigidmd.engines.openmm.system import NM, Group, layout, library, openmm_system
 from rigidmd.engines.protocol import Tally
-from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, intramolecular_energy, self_energy
@@ -26,7 +24,7 @@ from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
 if TYPE_CHECKING:
-    import openmm
+    pass
 
 PLATFORMS = ("CPU", "Reference", "CUDA", "OpenCL", "HIP")
 ANGSTROM = 1 / NM  # Å per nm
@@ -35,31 +33,6 @@ FORCE = KJ_PER_MOL * NM
 #: Strain of the finite differences for the virial, for energies in double precision or not. The error of a difference
 #: is a few hundred times the strain squared, plus rounding divided by the strain.
 STRAIN = {True: 2e-5, False: 5e-4}
-
-
-class ParticleModel(NamedTuple):
-    """A system as particles of OpenMM, and the conversion from and to rigid bodies."""
-
-    view: ForceFieldView
-    particles: Layout
-    bodies: RigidBodies
-
-    def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
-        at, velocity = np.zeros((2, len(self.particles.mass), 3))
-        at[self.particles.site] = self.view.system.site_positions(state)
-        at[self.particles.point], velocity[self.particles.point] = self.bodies.points(state)
-        velocity[self.particles.mass == 0] = 0.0
-        return at, velocity
-
-    def made(self, state: State, separate: bool) -> "openmm.System":
-        """OpenMM's system in the cell of a state; see `openmm_system`."""
-        return openmm_system(self.view, self.particles, state.cell, separate)
-
-
-def particle_model(view: ForceFieldView) -> ParticleModel:
-    particles = layout(view)
-    return ParticleModel(view, particles, RigidBodies(view.system, particles.points))
 
 
 def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
@@ -86,13 +59,15 @@ class OpenmmEngine(ExternalEngine):
         view = self._view
         where, properties = platform_of(platform, system)
         self.version = f"OpenMM {mm.__version__} on {platform}"
-        self._model = particle_model(view)
+        self._particles = layout(view)
         #: Whether forces are computed in double precision.
         self._double = platform == "Reference" or properties.get("Precision") == "double"
         self._integrator = integrator_of(view, stage, TOLERANCES[properties.get("Precision", "double")])
         rest = mm.VerletIntegrator(0.001)
         try:
-            evaluated, moved = (self._model.made(system.state, separate) for separate in (True, False))
+            evaluated, moved = (
+                openmm_system(self._particles, system.state.cell, separate) for separate in (True, False)
+            )
             for force in extra_forces(view, stage):
                 moved.addForce(force)
             self._evaluating_context = mm.Context(evaluated, rest, where, properties)
@@ -116,8 +91,8 @@ class OpenmmEngine(ExternalEngine):
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         if self._seen is None or not same_state(self._seen[0], state):
             position, force = self._forces(state)
-            load = self._model.bodies.load(state, position, force)
-            virial = self._virial(state, self._model.bodies.intramolecular_virial(position, force))
+            load = self._particles.bodies.load(state, position, force)
+            virial = self._virial(state, self._particles.bodies.intramolecular_virial(position, force))
             self._seen = state.copy(), load, self._tallies(state, virial)
         _, load, tallies = self._seen
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
@@ -148,7 +123,7 @@ class OpenmmEngine(ExternalEngine):
         if same_state(self._known_state, state):
             return
         self._put(self._moving_context, state)
-        velocity = self._model.positions(state)[1]
+        velocity = self._particles.positions(state)[1]
         self._moving_context.setVelocities(velocity * NM)
         self._heat_offset = float(state.energy_ledger[HEAT]) - self._heat(state)
         self._known_state = state.copy()
@@ -157,19 +132,19 @@ class OpenmmEngine(ExternalEngine):
         """Set the positions and the cell of a context."""
         if not state.is_finite:
             raise NotFiniteError(state)
-        if self._model.view.is_periodic:
+        if self._particles.view.is_periodic:
             context.setPeriodicBoxVectors(*(state.cell * NM))
-        context.setPositions(self._model.positions(state)[0] * NM)
+        context.setPositions(self._particles.positions(state)[0] * NM)
 
     def _receive(self, state: State) -> None:
         had = self._moving_context.getState(getPositions=True, getVelocities=True)
-        point = self._model.particles.point
+        point = self._particles.point
         position = had.getPositions(asNumpy=True)._value[point] * ANGSTROM
         velocity = had.getVelocities(asNumpy=True)._value[point] * ANGSTROM
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
         cell = had.getPeriodicBoxVectors(asNumpy=True)._value * ANGSTROM if self._stage.has_barostat else state.cell
-        found = self._model.bodies.state(state, position, velocity, cell)
+        found = self._particles.bodies.state(state, position, velocity, cell)
         if self._stage.has_barostat:  # OpenMM wraps molecules into the box whenever it changes the box
             moved = found.position @ np.linalg.inv(cell) - state.position @ np.linalg.inv(state.cell)
             found.position[:] -= np.rint(moved) @ cell
@@ -189,7 +164,7 @@ class OpenmmEngine(ExternalEngine):
         """
         if self.conserves_energy:
             return 0.0
-        groups = integration_groups(self._model.view, self._stage)
+        groups = integration_groups(self._particles.view, self._stage)
         energy = self._moving_context.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
         return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
 
@@ -203,11 +178,11 @@ class OpenmmEngine(ExternalEngine):
         self._put(self._evaluating_context, state)
         acting = self._groups - {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB}
         force = self._evaluating_context.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
-        return self._model.bodies.points(state)[0], force[self._model.particles.point] * FORCE
+        return self._particles.bodies.points(state)[0], force[self._particles.point] * FORCE
 
     def _tallies(self, state: State, virial: np.ndarray) -> dict[str, Tally]:
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
-        view = self._model.view
+        view = self._particles.view
         self._put(self._evaluating_context, state)
         found = {"lennard_jones": self._energy(Group.LENNARD_JONES)} if Group.LENNARD_JONES in self._groups else {}
         law = view.coulomb
@@ -228,7 +203,7 @@ class OpenmmEngine(ExternalEngine):
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""
-        view, total = self._model.view, 0.0
+        view, total = self._particles.view, 0.0
         species = view.system.model.species
         for k, m in enumerate(view.system.species):
             count = int(((species == k) & ~view.frozen).sum())
@@ -250,7 +225,7 @@ class OpenmmEngine(ExternalEngine):
         takes two energies instead of twelve at each observation.
         """
         virial, strain = np.zeros((3, 3)), STRAIN[self._double]
-        if not self._model.view.is_periodic:
+        if not self._particles.view.is_periodic:
             return virial
         groups = self._groups - {Group.TAIL}
 

@@ -8,9 +8,8 @@ from rigidmd.core.files import atomic_file, write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.openmm.engine import ParticleModel, particle_model
 from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, extra_forces, integrator_of
-from rigidmd.engines.openmm.system import NM, library
+from rigidmd.engines.openmm.system import NM, Layout, layout, library, openmm_system
 
 if TYPE_CHECKING:
     from openmm.app import Topology
@@ -87,9 +86,9 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     """Write the folder for a system that begins at a state, and return the names of its files. Raises OutputError, and
     EngineError if OpenMM is not installed."""
     mm = library()
-    model = particle_model(view)
-    position, velocity = (values * NM for values in model.positions(state))
-    made = model.made(state, separate=False)
+    particles = layout(view)
+    position, velocity = (values * NM for values in particles.positions(state))
+    made = openmm_system(particles, state.cell, separate=False)
     context = mm.Context(made, mm.VerletIntegrator(0.001), mm.Platform.getPlatformByName("Reference"))
     context.setPositions(position)
     context.setVelocities(velocity)
@@ -118,18 +117,18 @@ def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     with atomic_file(folder / TOPOLOGY) as temporary, open(temporary, "w", encoding="utf-8") as file:
         from openmm import Vec3, app
 
-        app.PDBFile.writeFile(_topology(model), [Vec3(*row) for row in (position / NM).tolist()], file)  # Å
+        app.PDBFile.writeFile(_topology(particles), [Vec3(*row) for row in (position / NM).tolist()], file)  # Å
     return [*text, TOPOLOGY]
 
 
-def _topology(model: ParticleModel) -> "Topology":
+def _topology(particles: Layout) -> "Topology":
     """Names of all particles. Mass points without a site are called P1, P2, ..."""
     from openmm import app
 
-    made, system = app.Topology(), model.view.system
+    made, system = app.Topology(), particles.view.system
     chain = made.addChain()
     index = system.model.species
-    count = [*model.particles.first, len(model.particles.mass)]
+    count = [*particles.first, len(particles.mass)]
     for n, k in enumerate(index):
         m = system.species[k]
         residue = made.addResidue(str(m.residue_names[0]), chain)

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import erfc
 
+from rigidmd.core.state import State
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
 from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
 from rigidmd.engines.mass_points import MassPoints, mass_points
-from rigidmd.engines.rigid_bodies import Points
+from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.engines.system import charges_in
 from rigidmd.errors import EngineError
 from rigidmd.forces.ewald.errors import pme_grid_for, real_error
@@ -106,21 +107,30 @@ def _unsupported_in_stage(stage: Stage) -> list[str]:
 class Layout(NamedTuple):
     """The particles of a system: sites and mass points, molecule by molecule. q particles, p mass points, s sites."""
 
+    view: ForceFieldView
+    bodies: RigidBodies  # of the mass points
     mass: np.ndarray  # (q,) u; 0 for virtual sites and frozen particles
     molecule: np.ndarray  # (q,)
     site: np.ndarray  # (s,) particle of each site
     point: np.ndarray  # (p,) particle of each mass point
-    points: Points
     of_species: list[MassPoints]
     first: np.ndarray  # (n,) first particle of each molecule
     local: list[np.ndarray]  # for each species the particles of its mass points, counted from `first`
 
-    def excluded(self, view: ForceFieldView) -> list[tuple[int, int]]:
+    def positions(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions, Å, and velocities, Å/ps, of all particles (q, 3) at a state."""
+        at, velocity = np.zeros((2, len(self.mass), 3))
+        at[self.site] = self.view.system.site_positions(state)
+        at[self.point], velocity[self.point] = self.bodies.points(state)
+        velocity[self.mass == 0] = 0.0
+        return at, velocity
+
+    def excluded(self) -> list[tuple[int, int]]:
         """Pairs of particles that do not interact: within a molecule, and between frozen molecules."""
         pairs = []
         for a, n in zip(self.first, np.diff([*self.first, len(self.mass)]), strict=True):
             pairs += [(int(a) + i, int(a) + j) for i in range(n) for j in range(i + 1, n)]
-        frozen = np.flatnonzero(view.frozen[self.molecule])
+        frozen = np.flatnonzero(self.view.frozen[self.molecule])
         one, other = (frozen[index] for index in np.triu_indices(len(frozen), 1))
         between = self.molecule[one] != self.molecule[other]
         return pairs + list(zip(one[between].tolist(), other[between].tolist(), strict=True))
@@ -141,25 +151,26 @@ def layout(view: ForceFieldView) -> Layout:
     first = np.cumsum(count) - count
     sites = system.sites_per_molecule
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
+    molecule = np.repeat(np.arange(len(species)), count)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
         gather_per_molecule([body.position_body for body in bodies], species),
         gather_per_molecule([body.mass for body in bodies], species),
     )
     return Layout(
-        gather_per_molecule(mass, species), np.repeat(np.arange(len(species)), count),
-        np.repeat(first, sites) + within, np.concatenate([first[i] + local[k] for i, k in enumerate(species)]), points,
+        view, RigidBodies(system, points), gather_per_molecule(mass, species), molecule,
+        np.repeat(first, sites) + within, np.concatenate([first[i] + local[k] for i, k in enumerate(species)]),
         bodies, first, local,
     )  # fmt: skip
 
 
-def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
+def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openmm.System":
     """The `openmm.System` with all forces except a barostat, and the initial cell (3, 3).
 
     separate : whether Lennard-Jones and Coulomb forces are separate even if one force can have both, which is faster: a
         step of 512 waters with PME takes 8 ms instead of 11 on two cores
     """
-    mm = library()
+    mm, view = library(), particles.view
     made = mm.System()
     for mass in particles.mass:
         made.addParticle(float(mass))
@@ -173,7 +184,7 @@ def openmm_system(view: ForceFieldView, particles: Layout, cell: np.ndarray, sep
             made.addConstraint(where[i], where[j], distance * NM)
         for k, site in body.virtual_sites.items():
             made.setVirtualSite(int(a) + k, _openmm_virtual_site(mm, where, site.weight.tolist(), site.cross))
-    excluded = particles.excluded(view)
+    excluded = particles.excluded()
     for force, group in _forces(mm, view, particles, separate):
         force.setForceGroup(group)
         add = force.addException if isinstance(force, mm.NonbondedForce) else None
