@@ -116,18 +116,14 @@ def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
 
 def _left_out(system: BodySystem) -> list[str]:
     """What is not compiled for this body, and why."""
-    out = ["box, neighbour lists, pair forces, threads: there is one body"]
-    if not system.translates:
-        out.append("translation: the body is pinned")
-    if not system.rotates:
-        out.append("rotation: the body is a point")
     body = system.body
-    if isinstance(body.frame, InertialFrame):
-        out.append("frame: its axes do not rotate")
-    if isinstance(body.resistance, NoResistance):
-        out.append("resistance: none")
-    if not isinstance(body.rotor, DrivenRotor):
-        out.append("wheels and changing inertia: none")
-    if not system.terms:
-        out.append("forces: none")
-    return out
+    reasons = {
+        "box, neighbour lists, pair forces, threads: there is one body": True,
+        "translation: the body is pinned": not system.translates,
+        "rotation: the body is a point": not system.rotates,
+        "frame: its axes do not rotate": isinstance(body.frame, InertialFrame),
+        "resistance: none": isinstance(body.resistance, NoResistance),
+        "wheels and changing inertia: none": not isinstance(body.rotor, DrivenRotor),
+        "forces: none": not system.terms,
+    }
+    return [reason for reason, applies in reasons.items() if applies]

@@ -48,11 +48,8 @@ def body_errors(
             faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
         if scene.gravity is not None and not centre.any() and rotates:
             faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
-        faults += [
-            f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
-            for k, entry in enumerate(scene.applied)
-            if entry.force_N is not None and not any(entry.at_m or ())
-        ]
+        idle = [k for k, entry in enumerate(scene.applied) if entry.force_N is not None and not any(entry.at_m or ())]
+        faults += [f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m" for k in idle]
     return faults
 
 

@@ -67,12 +67,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
             system = with_user_code(system)
             scene, model = system.scene, system.model
     if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
-        faults = [
-            f"stages.{k}: {stage.ensemble} changes the box, and {names} depend on absolute positions in it: "
-            "keep the volume"
-            for k, stage in enumerate(scene.stages)
-            if stage.changes_box
-        ]
+        why = f"changes the box, and {names} depend on absolute positions in it: keep the volume"
+        faults = [f"stages.{k}: {stage.ensemble} {why}" for k, stage in enumerate(scene.stages) if stage.changes_box]
         if faults:
             raise SceneError(scene.source, faults)
     check_memory(system)

@@ -34,10 +34,8 @@ def overlaps(system: "System") -> list[str]:
         both = sigma[i] > 0 and sigma[j] > 0
         if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
             a, b = system.sites.molecule[[i, j]]
-            faults.append(
-                f"molecules {a + 1} and {b + 1} overlap: {system.sites.name[i]} and {system.sites.name[j]} "
-                f"have a distance of {distance:.3f} Å"
-            )
+            names = " and ".join(str(system.sites.name[k]) for k in (i, j))
+            faults.append(f"molecules {a + 1} and {b + 1} overlap: {names} have a distance of {distance:.3f} Å")
     return faults[:5] + ([f"and {len(faults) - 5} more"] if len(faults) > 5 else [])
 
 

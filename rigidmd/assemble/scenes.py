@@ -90,10 +90,8 @@ def atoms_errors(atoms: Any) -> list[str]:
     if len(atoms) == 0:
         return ["there are no atoms"]
     values = [("position", atoms.positions)]
-    if atoms.has("momenta"):
-        values.append(("momentum", atoms.get_momenta()))
-    if atoms.has("masses"):
-        values.append(("mass", atoms.get_masses()[:, None]))
+    values += [("momentum", atoms.get_momenta())] if atoms.has("momenta") else []
+    values += [("mass", atoms.get_masses()[:, None])] if atoms.has("masses") else []
     faults = []
     for what, array in values:
         if not (fine := np.isfinite(array).all(axis=1)).all():
@@ -117,10 +115,8 @@ def text_of(atoms: "ase.Atoms") -> str:
     """Atoms as extended XYZ with all digits of numbers, and with a cell if they are periodic."""
     columns = [("species", "S", [[symbol] for symbol in atoms.get_chemical_symbols()])]
     columns.append(("pos", "R", _digits(atoms.positions)))
-    if atoms.has("momenta"):
-        columns.append(("momenta", "R", _digits(atoms.get_momenta())))
-    if atoms.has("masses"):
-        columns.append(("masses", "R", _digits(atoms.get_masses()[:, None])))
+    columns += [("momenta", "R", _digits(atoms.get_momenta()))] if atoms.has("momenta") else []
+    columns += [("masses", "R", _digits(atoms.get_masses()[:, None]))] if atoms.has("masses") else []
     for name, kind in ((NAMES, "S"), (RESIDUE_NAMES, "S"), (RESIDUE_NUMBERS, "I")):
         values = [str(value) for value in atoms.arrays.get(name, ())]
         if values and all(value.isprintable() and len(value.split()) == 1 for value in values):

@@ -10,10 +10,7 @@ DISTRIBUTIONS = {
     "nve": ("the microcanonical distribution", "energy"),
     "nph": ("the isoenthalpic distribution", "enthalpy with the energy of the piston"),
     "nvt": ("the canonical distribution, exp(-H/kT)", "energy less heat"),
-    "npt": (
-        "the isothermal-isobaric distribution, exp(-(H + p V)/kT)",
-        "energy less heat and less the work of the box",
-    ),
+    "npt": ("the isothermal-isobaric distribution, exp(-(H + p V)/kT)", "energy less heat and the work of the box"),
 }
 
 

@@ -179,12 +179,9 @@ def _read_molecules(
 def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
     """Raise StructureError for atom types that are not sites or elements of the scene."""
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
-    faults = [
-        f"structure.atom_types.{number} = {name!r} is not a site or element of the scene's molecules; there are "
-        f"{', '.join(known)}{did_you_mean(name, known)}"
-        for number, name in atom_types.items()
-        if name not in (*known, "X")
-    ]
+    hint = f"is not a site or element of the scene's molecules; there are {', '.join(known)}"
+    unknown = [(number, name) for number, name in atom_types.items() if name not in (*known, "X")]
+    faults = [f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}" for k, name in unknown]
     if faults:
         raise StructureError(str(path), faults)
 

@@ -117,27 +117,22 @@ def _short_cutoff_notes(
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
     """What is not compiled for this scene, and why."""
-    out = []
-    if "lennard_jones" not in terms:
-        out.append("Lennard-Jones: " + ("no site has it" if scene.forces.lennard_jones else "lennard_jones is false"))
-    if not any(name.startswith("coulomb") for name in terms):
-        out.append(
-            "charges: " + ("electrostatics is none" if scene.forces.electrostatics == "none" else "no site has one")
-        )
-    elif "coulomb_reciprocal" not in terms:
-        out.append(f"sums over periodic images, Fourier transforms: electrostatics is {scene.forces.electrostatics}")
-    elif scene.forces.electrostatics == "ewald":
-        out.append("Fourier transforms: electrostatics is ewald, a direct sum over k-vectors")
-    if isinstance(model.rotor, NoRotor):
-        out.append("rotation and torques: every molecule is a point")
-    if space.volume == inf:
-        out.append("periodic images: no box")
-    if not any(stage.has_thermostat for stage in scene.stages):
-        out.append("thermostat: no NVT or NPT stage")
-    if not any(stage.has_barostat for stage in scene.stages):
-        out.append("barostat: no NPT or NPH stage")
-    if scene.run.remove_momentum_interval_ps is False:
-        out.append("removal of the total momentum: run.remove_momentum_interval_ps is false")
-    if not scene.forces.tail_correction:
-        out.append("tail correction: not requested")
-    return out
+    method, has_images = scene.forces.electrostatics, "coulomb_reciprocal" in terms
+    has_charges = any(name.startswith("coulomb") for name in terms)
+    no_lennard_jones = "no site has it" if scene.forces.lennard_jones else "lennard_jones is false"
+    no_charges = "electrostatics is none" if method == "none" else "no site has one"
+    reasons = {
+        f"Lennard-Jones: {no_lennard_jones}": "lennard_jones" not in terms,
+        f"charges: {no_charges}": not has_charges,
+        f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_images,
+        "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": has_images and method == "ewald",
+        "rotation and torques: every molecule is a point": isinstance(model.rotor, NoRotor),
+        "periodic images: no box": space.volume == inf,
+        "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
+        "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
+        "removal of the total momentum: run.remove_momentum_interval_ps is false": (
+            scene.run.remove_momentum_interval_ps is False
+        ),
+        "tail correction: not requested": not scene.forces.tail_correction,
+    }
+    return [reason for reason, applies in reasons.items() if applies]

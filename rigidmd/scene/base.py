@@ -183,12 +183,10 @@ class Scene(Section, Displayed):
         """Messages on missing files, with line and key."""
         faults = []
         for key, path in self.inputs.items():
-            if not (fault := unreadable_reason(path)):
-                continue
-            keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
-            faults.append(
-                f"{location_of(keys, text, overridden)}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}"
-            )
+            if fault := unreadable_reason(path):
+                keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
+                where = location_of(keys, text, overridden)
+                faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         return faults
 
 
@@ -245,9 +243,8 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     names = re.findall(r"[a-z]\w*(?:\.\w+)*", fault)
     tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)]) if overridden else ()
     keys = [table + name for table in tables for name in names]
-    return "".join(
-        f"; --set {key}= removes it" for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)
-    )
+    there = [key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)]
+    return "".join(f"; --set {key}= removes it" for key in there)
 
 
 def _has_key(data: Any, key: str) -> bool:

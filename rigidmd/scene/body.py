@@ -373,16 +373,11 @@ class BodyScene(Scene):
         tables = {key: value for key, value in data.items() if isinstance(value, dict)}
         body, start, fluid = (tables.get(key, {}) for key in ("body", "start", "fluid"))
         if body.get("pinned") is True:
-            found += [
-                (["start", key], "the body is pinned at a point and cannot be moved: omit it")
-                for key in ("position_m", "velocity_m_s")
-                if key in start
-            ]
-            found += [
-                (["fluid", key], "the body is pinned at a point: no such force acts on it")
-                for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
-                if isinstance(fluid.get(key), list | tuple) and any(fluid[key])
-            ]
+            moved = "the body is pinned at a point and cannot be moved: omit it"
+            found += [(["start", key], moved) for key in ("position_m", "velocity_m_s") if key in start]
+            forces = ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
+            given = [key for key in forces if isinstance(fluid.get(key), list | tuple) and any(fluid[key])]
+            found += [(["fluid", key], "the body is pinned at a point: no such force acts on it") for key in given]
         ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
         if "changing_inertia" in data and any(key in body for key in ways):
             key = next(key for key in ways if key in body)
@@ -397,16 +392,11 @@ class BodyScene(Scene):
             if fluid.density_kg_m3 is not None:
                 if body.solid is None or body.solid.shape not in ("sphere", "ellipsoid") or body.pinned:
                     yield "fluid.density_kg_m3 needs a body.solid that is a sphere or an ellipsoid, not pinned"
-                yield from [
-                    f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows"
-                    for key in ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
-                    if getattr(fluid, key) is not None
-                ]
-            if (
-                fluid.centre_of_buoyancy_m is not None
-                and fluid.displaced_mass_kg is None
-                and fluid.density_kg_m3 is None
-            ):
+                follow = ("displaced_mass_kg", "added_mass_kg", "added_inertia_kg_m2")
+                given = [key for key in follow if getattr(fluid, key) is not None]
+                yield from [f"fluid.{key} contradicts fluid.density_kg_m3, from which it follows" for key in given]
+            buoyant = fluid.displaced_mass_kg is not None or fluid.density_kg_m3 is not None
+            if fluid.centre_of_buoyancy_m is not None and not buoyant:
                 yield "fluid.centre_of_buoyancy_m would do nothing without displaced_mass_kg or density_kg_m3"
             if (fluid.displaced_mass_kg or fluid.density_kg_m3) and self.gravity is None:
                 yield "fluid: buoyancy needs [gravity]"

@@ -289,11 +289,8 @@ class MolecularScene(Scene):
 
     def _errors(self):
         if self.structure is None:
-            yield from [
-                f"molecules.{k}.count is missing (required without a structure file)"
-                for k, species in enumerate(self.molecules)
-                if species.count is None
-            ]
+            missing = [k for k, species in enumerate(self.molecules) if species.count is None]
+            yield from [f"molecules.{k}.count is missing (required without a structure file)" for k in missing]
             if self.box.lengths_A is None and self.box.density_g_cm3 is None:
                 yield "box needs lengths_A or density_g_cm3, or there must be a structure file"
         elif self.box.density_g_cm3 is not None:

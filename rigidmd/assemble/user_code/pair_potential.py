@@ -88,14 +88,14 @@ class PairLaw:
             raise PairPotentialError(f"switch_start_A = {start:g} is beyond the cutoff of {cutoff:g} Å")
         formula = self.formula(cutoff)
         types = _SiteTypes(self, formula, system.species)
-        chosen = [np.flatnonzero([entry is not None for entry in of]) for of in types.of_species]
-        if not any(len(own) for own in chosen):
+        indices = [np.flatnonzero([entry is not None for entry in entries]) for entries in types.of_species]
+        if not any(len(sites) for sites in indices):
             raise PairPotentialError("no site of the scene has its parameters")
         index = system.model.species
-        offsets = [m.positions_body[c] for m, c in zip(system.species, chosen, strict=True)]
+        offsets = [m.positions_body[sites] for m, sites in zip(system.species, indices, strict=True)]
         sites = sites_of(index, offsets, system.model.inverse_inertia)
-        numbers_of = [[types.number[entry] for entry in of if entry is not None] for of in types.of_species]
-        kind = gather_per_molecule([np.array(own, int) for own in numbers_of], index)
+        numbers_of = [[types.number[entry] for entry in entries if entry is not None] for entries in types.of_species]
+        kind = gather_per_molecule([np.array(values, int) for values in numbers_of], index)
         shape = truncation_of(name, cutoff, start)
         count = len(types.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
@@ -186,25 +186,19 @@ class _SiteTypes:
         listed = [*(potential.of_sites or {}), *potential.sites, *(name for pair in potential.pairs for name in pair)]
         there = f"; there are {', '.join(known)}"
         self._named = {name: sites_named(species, name) for name in listed}
-        faults = [
-            f"no site is {name!r}{did_you_mean(name, list(known)) or there}"
-            for name, sites in self._named.items()
-            if not any(mask.any() for mask in sites)
-        ]
+        unknown = [name for name, sites in self._named.items() if not any(mask.any() for mask in sites)]
+        faults = [f"no site is {name!r}{did_you_mean(name, list(known)) or there}" for name in unknown]
         self._needed = [name for name in formula.parameters if name not in potential.constants and not formula.shared]
-        of_pairs = {"-".join(pair): given for pair, given in potential.pairs.items()}
-        for where, given in [*(potential.of_sites or {}).items(), *of_pairs.items()]:
+        of_pairs = [("-".join(pair), given) for pair, given in potential.pairs.items()]
+        for where, given in [*(potential.of_sites or {}).items(), *of_pairs]:
             faults += [f"{where}: there is no {name}" for name in self._needed if name not in given]
             faults += [f"{where}: {self._unknown(name)}" for name in given if name not in formula.parameters]
         if potential.of_sites == {} and not potential.pairs:
             faults += [f"there is no {name} among its parameters" for name in self._needed]
         faults += [self._unknown(name) for name in potential.constants if not _has(potential.energy, formula, name)]
         faults += [f"mixing: {self._unknown(name)}" for name in potential.mixing if name not in formula.parameters]
-        faults += [
-            f"pairs: {'-'.join(pair)} is given twice"
-            for pair in potential.pairs
-            if pair[0] < pair[1] and pair[::-1] in potential.pairs
-        ]
+        twice = [pair for pair in potential.pairs if pair[0] < pair[1] and pair[::-1] in potential.pairs]
+        faults += [f"pairs: {'-'.join(pair)} is given twice" for pair in twice]
         if faults:
             raise PairPotentialError(*faults)
         self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
@@ -327,9 +321,9 @@ def pair_law(
         raise ValueError("table must be two lists: distances in Å, energies in kJ/mol")
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
-    for own, rule in (mixing or {}).items():
+    for parameter, rule in (mixing or {}).items():
         if rule not in RULES:
-            raise ValueError(f"mixing of {own} is {rule!r}; there are {', '.join(RULES)}")
+            raise ValueError(f"mixing of {parameter} is {rule!r}; there are {', '.join(RULES)}")
     kind, constants, of_sites = None, {}, None
     if parameters is not None:
         kind = type(parameters) if hasattr(parameters, "_asdict") else None
@@ -337,10 +331,8 @@ def pair_law(
         flat = [key for key, value in parameters.items() if isinstance(value, int | float | np.number)]
         if flat and len(flat) < len(parameters):
             others = ", ".join(str(key) for key in parameters if key not in flat)
-            raise ValueError(
-                f"parameters are either numbers, the same for all sites, or tables of numbers by site; {flat[0]} is a "
-                f"number, and {others} is not"
-            )
+            either = "parameters are either numbers, the same for all sites, or tables of numbers by site"
+            raise ValueError(f"{either}; {flat[0]} is a number, and {others} is not")
         if flat:
             constants, of_sites = _numbers("parameters", parameters), {}
         else:
