@@ -1,6 +1,6 @@
 """Pointers in LLVM IR: opaque where llvmlite has them, with types where it needs them.
 
-LLVM has only opaque pointers, and llvmlite is removing typed ones. Numba's own pointers are still typed, and llvmlite
+LLVM has only opaque pointers, and llvmlite is removing typed ones. The pointers of Numba are still typed, and llvmlite
 0.44, the oldest one supported, has an LLVM that needs typed pointers.
 """
 

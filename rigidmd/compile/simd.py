@@ -226,7 +226,8 @@ to_double = intrinsic(_conversion(types.float64))
 
 
 #: Coefficients of e, e², ... in (1 - e)^-p - 1, for 1/x (p = 1), 1/sqrt(x) (p = 1/2) and 1/sqrt(x)³ (p = 3/2).
-QUOTIENT, ROOT, CUBE = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128), (3 / 2, 15 / 8, 35 / 16, 315 / 128)
+INVERSE_SERIES, ROOT_SERIES = (1.0, 1.0, 1.0), (1 / 2, 3 / 8, 5 / 16, 35 / 128)
+CUBE_SERIES = (3 / 2, 15 / 8, 35 / 16, 315 / 128)
 
 
 def _series_terms(x) -> int:
@@ -269,8 +270,8 @@ def _estimate(name):
 
 #: 1/sqrt(x) and 1/x of a vector by the estimates of the hardware, with relative errors up to 2^-14 with AVX-512, else
 #: 1.5 2^-12. The second is used with AVX-512 only.
-_root_estimate = intrinsic(_estimate("rsqrt"))
-_quotient_estimate = intrinsic(_estimate("rcp"))
+_estimate_inverse_root = intrinsic(_estimate("rsqrt"))
+_estimate_inverse = intrinsic(_estimate("rcp"))
 
 
 @intrinsic
@@ -296,14 +297,14 @@ def inverse_square_root(x):
 # The series are explicit, because LLVM's choice depends on the processor: for some it computes a root and divides, for
 # others it corrects an estimate of float32 by one step, with errors of the cube up to 5.8e-7 instead of 1.9e-7.
 @implements(inverse_square_root, inline=True)
-def _inverse_root(x):
+def _inverse_square_root(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / sqrt(x)
     if terms := _series_terms(x):
-        series = ROOT[:terms]
+        series = ROOT_SERIES[:terms]
 
         def from_estimate(x):
-            y = _root_estimate(x)
+            y = _estimate_inverse_root(x)
             e = 1.0 - x * y * y
             return y + y * (e * _horner(series, e))
 
@@ -330,14 +331,14 @@ def inverse_root_and_cube(x):
 
 
 @implements(inverse_root_and_cube, inline=True)
-def _root_and_cube(x):
+def _inverse_root_and_cube(x):
     if isinstance(x, Lanes) and _series_terms(x):
-        series, root_series = (1.0, *CUBE[: _series_terms(x)]), ROOT[: _series_terms(x)]
+        series, root_series = (1.0, *CUBE_SERIES[: _series_terms(x)]), ROOT_SERIES[: _series_terms(x)]
 
         def from_estimate(x):
             # The cube of a corrected root would take one multiplication more; pairs with a reaction field then take 5 %
             # longer (AVX-512). The root from the cube would have two more rounding errors, visible in energies.
-            y = _root_estimate(x)
+            y = _estimate_inverse_root(x)
             y2 = y * y
             e = 1.0 - x * y2
             return y + y * (e * _horner(root_series, e)), y * y2, _horner(series, e)
@@ -396,10 +397,10 @@ def _inverse(x):
     if not isinstance(x, Lanes):
         return lambda x: 1 / x
     if _fills_avx512(x):  # without AVX-512 a division in single precision is faster
-        series = QUOTIENT[: _series_terms(x)]
+        series = INVERSE_SERIES[: _series_terms(x)]
 
         def from_estimate(x):
-            y = _quotient_estimate(x)
+            y = _estimate_inverse(x)
             e = 1.0 - x * y
             return y + y * (e * _horner(series, e))
 
@@ -427,8 +428,8 @@ def _selection(sign):
     return chosen
 
 
-_larger = intrinsic(_selection(">"))
-_smaller = intrinsic(_selection("<"))
+_vector_maximum = intrinsic(_selection(">"))
+_vector_minimum = intrinsic(_selection("<"))
 
 
 def maximum(x, y):
@@ -437,9 +438,9 @@ def maximum(x, y):
 
 
 @implements(maximum, inline=True)
-def _larger_of_both(x, y):
+def _maximum(x, y):
     if isinstance(x, Lanes):
-        return lambda x, y: _larger(x, y)
+        return lambda x, y: _vector_maximum(x, y)
     return lambda x, y: max(x, y)
 
 
@@ -449,9 +450,9 @@ def minimum(x, y):
 
 
 @implements(minimum, inline=True)
-def _smaller_of_both(x, y):
+def _minimum(x, y):
     if isinstance(x, Lanes):
-        return lambda x, y: _smaller(x, y)
+        return lambda x, y: _vector_minimum(x, y)
     return lambda x, y: min(x, y)
 
 
@@ -682,7 +683,7 @@ def lanes_of(array):
 
 
 @implements(lanes_of, inline=True)
-def _width_of(array):
+def _lanes_of(array):
     count = LANE_COUNTS[array.dtype]
     return lambda array: count
 
@@ -693,7 +694,7 @@ def convert_to(x, array):
 
 
 @implements(convert_to, inline=True)
-def _narrowed(x, array):
+def _convert_to(x, array):
     if array.dtype == types.float32:
         return lambda x, array: to_single(x)
     return lambda x, array: x

@@ -41,24 +41,24 @@ def translate(translation, rotor, state, time, h):
 
 
 @implements(translate, inline=True)
-def _carry(translation, rotor, state, time, h):
+def _translate(translation, rotor, state, time, h):
     if is_a(translation, NoTranslation):
         return lambda translation, rotor, state, time, h: rotate_body(rotor, state, time, h)
     if is_a(translation, FreeTranslation):
 
-        def fly(translation, rotor, state, time, h):
+        def translate_free(translation, rotor, state, time, h):
             for k in range(3):
                 state.position[0, k] += h * state.velocity[0, k]
             rotate_body(rotor, state, time, h)
 
-        return fly
+        return translate_free
 
-    def swim(translation, rotor, state, time, h):
+    def translate_fluid(translation, rotor, state, time, h):
         translate_in_fluid(translation, state, 0.5 * h)
         rotate_body(rotor, state, time, h)
         translate_in_fluid(translation, state, 0.5 * h)
 
-    return swim
+    return translate_fluid
 
 
 @kernel(inline=True)
