@@ -22,6 +22,8 @@ from rigidmd.io.write import nine_digits, write_csv, write_json
 from rigidmd.run.record import read_record
 
 ANALYSIS = "analysis.json"
+#: What analysis.json has of a curve.
+CURVE_KEYS = ("file", "label", "log", "level", "bars")
 #: Size of a figure, inches, and most curves in it.
 WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
 #: Headers of columns that are in the file and not drawn.
@@ -65,31 +67,18 @@ def write_results(
             written += [path, picture]
             files += [path.name, picture.name]
         entries[result.name] = {
-            "about": result.about,
-            "values": [value._asdict() for value in result.values],
-            "notes": result.notes,
-            "curves": [_described(curve) for curve in result.curves],
-            "files": files,
+            "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
+            "curves": [{key: getattr(curve, key) for key in CURVE_KEYS} for curve in result.curves], "files": files,
             "stretch": frames_used,
-        }
+        }  # fmt: skip
     for name, reason in failed.items():
-        entries[name] = {
-            "about": name,
-            "values": [],
-            "notes": [reason],
-            "curves": [],
-            "files": [],
-            "stretch": frames_used,
-        }
+        lists = {"values": [], "notes": [reason], "curves": [], "files": []}
+        entries[name] = {"about": name, **lists, "stretch": frames_used}
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for picture, curve in pictures.items():
         write_figure(picture, partial(draw_curve, curve))
     return [folder / ANALYSIS, *(path for path in written if path.is_file())]
-
-
-def _described(curve: Curve) -> dict[str, Any]:
-    return {"file": curve.file, "label": curve.label, "log": curve.log, "level": curve.level, "bars": curve.bars}
 
 
 def _rows(curve: Curve) -> list[list[Any]]:

@@ -63,7 +63,6 @@ class Curve:
     bars: bool = False
 
     def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
-        """Add a column with its errors."""
         self.columns[title], self.errors[title] = values, errors
 
 

@@ -139,14 +139,10 @@ class RigidFrames:
 
     def _of(self, frames: slice) -> "RigidFrames":
         return replace(
-            self,
-            time=self.time[frames],
-            cell=self.cell[frames],
-            positions=self.positions[frames],
-            Q=self.Q[frames],
+            self, time=self.time[frames], cell=self.cell[frames], positions=self.positions[frames], Q=self.Q[frames],
             velocities=None if self.velocities is None else self.velocities[frames],
             L=None if self.L is None else self.L[frames],
-        )
+        )  # fmt: skip
 
 
 def sites_named(molecule: Molecule, name: str) -> list[int]:
@@ -163,13 +159,9 @@ def known_names(system: System) -> list[str]:
 
 
 def fit_frames(
-    system: System,
-    sites: np.ndarray,
-    velocities: np.ndarray | None,
-    cells: np.ndarray,
-    wrapped: bool,
+    system: System, sites: np.ndarray, velocities: np.ndarray | None, cells: np.ndarray, wrapped: bool,
     progress: Callable[[float], object] = lambda fraction: None,
-) -> tuple[Bodies, list[str]]:
+) -> tuple[Bodies, list[str]]:  # fmt: skip
     """Bodies of frames, each array with a first axis (f,), and notes. Raises OutputError.
 
     sites (f, s, 3); velocities alike or None; cells (f, 3, 3)

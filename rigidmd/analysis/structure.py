@@ -81,7 +81,6 @@ def _thinned(frames: RigidFrames, enough: int) -> RigidFrames:
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:
-    """An array over frames in blocks."""
     return list(np.array_split(values, BLOCKS)) if len(values) >= 2 * BLOCKS else []
 
 
@@ -105,7 +104,6 @@ def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
 
 
 def _g(frames: RigidFrames, frame: int, a: str, b: str, width: float, bins: int, shells: np.ndarray) -> np.ndarray:
-    """g(r) of one frame (bins,)."""
     at, owner = frames.sites(a, slice(frame, frame + 1))
     at_2, owner_2 = (at, owner) if a == b else frames.sites(b, slice(frame, frame + 1))
     counts = count_pairs(at[0], owner, at_2[0], owner_2, frames.cell[frame], width, bins)

@@ -41,7 +41,6 @@ def interval_and_lags(frames: RigidFrames, what: str) -> tuple[float, int]:
 
 
 def _displacements(frames: RigidFrames, kind: Kind, lags: int) -> np.ndarray:
-    """Mean squared displacement (lags,), Å²."""
     return squared_displacement(frames.paths[:, kind.index], lags)
 
 
@@ -135,7 +134,6 @@ def _so_far(frames: RigidFrames, interval: float, lags: int) -> Curve:
 
 
 def _slope(time: np.ndarray, values: np.ndarray) -> float:
-    """Least-squares slope of values (t,) against time."""
     off = time - time.mean()
     return off @ values / (off @ off)
 

@@ -39,22 +39,14 @@ def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
     if system.rotates:  # omega along the principal axes, where it lies on ellipsoids
         omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
         columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
+    # omega stays on ellipsoids if the inertia is constant, the frame does not rotate, and no torque acts
+    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
     gravity = system.scene.gravity and system.scene.gravity.acceleration_m_s2
     return motion_figures(
-        system.scene.name,
-        columns=columns,
-        axis_body=drawn_axis(system),
-        inertia=system.inertia if _keeps_its_ellipsoids(system, samples) else None,
-        invariants=samples.invariants,
-        gravity=None if gravity is None else np.array(gravity),
-        translates=system.translates,
-    )
-
-
-def _keeps_its_ellipsoids(system: BodySystem, samples: Motion) -> bool:
-    """Whether the inertia is constant, the frame does not rotate, and |L| is conserved, as no torque acts."""
-    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
-    return steady and "L_size" in samples.invariants
+        system.scene.name, columns=columns, axis_body=drawn_axis(system),
+        inertia=system.inertia if steady and "L_size" in samples.invariants else None, invariants=samples.invariants,
+        gravity=None if gravity is None else np.array(gravity), translates=system.translates,
+    )  # fmt: skip
 
 
 #: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.

@@ -97,7 +97,7 @@ def open_axis(axis, **ticks) -> None:
 
 
 def thin_series(time: np.ndarray, values: np.ndarray, bins: int = 1500) -> tuple[np.ndarray, np.ndarray]:
-    """A long series reduced to the lowest and highest value of each of its parts; its curve looks the same."""
+    """A long series reduced to the lowest and highest value of each of its parts, whose curve is the same."""
     size = len(time) // bins
     if size < 4:
         return time, values

@@ -8,12 +8,5 @@ from rigidmd.run.simulation import Simulation
 from rigidmd.run.together import run_together
 
 __all__ = [
-    "BodySimulation",
-    "Every",
-    "MolecularSimulation",
-    "Moment",
-    "Observer",
-    "Results",
-    "Simulation",
-    "run_together",
-]
+    "BodySimulation", "Every", "MolecularSimulation", "Moment", "Observer", "Results", "Simulation", "run_together",
+]  # fmt: skip

@@ -67,7 +67,6 @@ def _final(results: "Results", system: System) -> "ase.Atoms":
 
 
 def _reader(results: "Results", system: System) -> Callable[[int], "ase.Atoms"]:
-    """A function that reads frame k."""
     from ase.calculators.singlepoint import SinglePointCalculator
 
     frames = results._frames

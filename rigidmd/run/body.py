@@ -18,7 +18,6 @@ from rigidmd.engines.cpu import Engine
 from rigidmd.engines.ode import OdeEngine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.io.checkpoint import Checkpoint
-from rigidmd.io.scene_file import write_scene
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.options import Options
@@ -26,7 +25,6 @@ from rigidmd.run.pilot.stable_step import fastest_body_rate, stable_angle
 from rigidmd.run.pilot.trial_systems import choose_for_body
 from rigidmd.run.provenance import plain
 from rigidmd.run.report import body_summary_text
-from rigidmd.run.results import Results
 from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
 from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
@@ -51,20 +49,16 @@ class BodySimulation(Simulation):
     """
 
     time_unit = "s"
+    _summary_text = staticmethod(body_summary_text)
 
     scene: BodyScene
     system: BodySystem
     engine: Engine
 
     def __init__(
-        self,
-        scene: BodyScene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        *,
-        applied: Mapping[str, Callable[[Pose], tuple]] | None = None,
-        **options: Unpack[Options],
-    ):
+        self, scene: BodyScene, folder: str | Path | None = None, force: bool = False, *,
+        applied: Mapping[str, Callable[[Pose], tuple]] | None = None, **options: Unpack[Options],
+    ):  # fmt: skip
         if of_molecules := [key for key in ("forces", "thermostat") if key in options]:
             raise SceneError(
                 scene.source,
@@ -180,21 +174,14 @@ class BodySimulation(Simulation):
     def _explain(self, error: SimulationError) -> str:
         return self._watch.check.explain(error, self.segment.dt, self._resume_data.stable)
 
-    def write_scene(self, folder: Path) -> None:
-        write_scene(folder, self.scene)
-
-    def introduction(self) -> str:
+    @property
+    def _headline(self) -> str:
         system, run = self.system, self.scene.run
         pinned = "" if system.translates else ", pinned"
-        first = (
+        return (
             f"{self.scene.name}: one body ({system.kind}{pinned}), {system.degrees_of_freedom} degrees of freedom; "
             f"{run.steps} steps of {run.timestep_s:g} s, {run.integrator.replace('_', ' ')}"
         )
-        return "\n".join([first, *(f"  {note}" for note in system.notes)])
-
-    def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes of the introduction and the warnings that were issued."""
-        return body_summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self) -> dict:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""

@@ -97,7 +97,6 @@ class MotionFiles(Observer):
             results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "BodySimulation") -> str:
-        """Save the motion so far, if there is any."""
         if not self._sampler.snapshots:
             return ""
         write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).written)

@@ -44,7 +44,6 @@ class CheckpointSchedule:
 
     @property
     def is_due(self) -> bool:
-        """Whether a checkpoint is due or requested."""
         return self.requested or clock.monotonic() - self._last >= self._seconds
 
     @property

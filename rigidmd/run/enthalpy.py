@@ -26,7 +26,6 @@ class EnthalpyPoint(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether energy and gradient are finite numbers."""
         return isfinite(self.energy) and bool(np.isfinite(self.gradient).all())
 
 

@@ -40,12 +40,9 @@ SEARCH_INTERVAL = 100
 
 
 def minimise(
-    system: System,
-    state: State,
-    stage: Stage,
-    stop: Callable[[], bool] = lambda: False,
+    system: System, state: State, stage: Stage, stop: Callable[[], bool] = lambda: False,
     advanced: Callable[[float], object] = lambda iterations: None,
-) -> Minimum:
+) -> Minimum:  # fmt: skip
     """Move a state, in place, to a minimum of energy or enthalpy with the limits of a stage; momenta and time stay.
 
     The method is L-BFGS (Nocedal & Wright 2006, algorithm 7.5) with moves of bounded length. Forces, torques and

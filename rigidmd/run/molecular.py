@@ -27,7 +27,7 @@ from rigidmd.io.ase_atoms import atoms_of_system
 from rigidmd.io.cells import edges_and_angles
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.progress import progress_of
-from rigidmd.io.scene_file import input_names, write_scene
+from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.run.minimise import minimise
@@ -41,7 +41,6 @@ from rigidmd.run.pilot.trial_systems import choose_for_molecules
 from rigidmd.run.provenance import plain
 from rigidmd.run.quantity_docs import describe_quantities
 from rigidmd.run.report import summary_text
-from rigidmd.run.results import Results
 from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
 from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
@@ -88,21 +87,16 @@ class MolecularSimulation(Simulation):
     """
 
     time_unit = "ps"
+    _summary_text = staticmethod(summary_text)
 
     scene: MolecularScene
     system: System
     engine: "Engine | ExternalEngine"
 
     def __init__(
-        self,
-        scene: MolecularScene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        *,
-        forces: Any = (),
-        thermostat: Any = None,
-        **options: Unpack[Options],
-    ):
+        self, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, *, forces: Any = (),
+        thermostat: Any = None, **options: Unpack[Options],
+    ):  # fmt: skip
         super().__init__(scene, folder, force, **options)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         self._built = build(scene.with_user_code(given, thermostat))
@@ -200,7 +194,6 @@ class MolecularSimulation(Simulation):
         self._resume_data = MolecularResumeData(removal=removal)
 
     def _compile(self) -> None:
-        """Compile the steps of every stage."""
         with user_errors_explained(self.system):
             for k, stage in enumerate(self.scene.stages):
                 if not (stage.is_auto or stage.is_minimisation):
@@ -388,41 +381,20 @@ class MolecularSimulation(Simulation):
         # an external engine may not report the heat of its thermostat
         known = not stage.is_minimisation and getattr(self.engine, "conserves_energy", True)
         return Sample(
-            step=moment.step,
-            time=moment.time,
-            potential=seen.potential / KJ_PER_MOL,
-            kinetic=seen.kinetic / KJ_PER_MOL,
-            energy=energy,
-            temperature=seen.temperature,
-            volume=volume * 1e-3 if boxed else nan,
-            density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
-            stage_name=stage.label,
-            temperature_translation=seen.temperature_translation,
+            step=moment.step, time=moment.time, potential=seen.potential / KJ_PER_MOL,
+            kinetic=seen.kinetic / KJ_PER_MOL, energy=energy, temperature=seen.temperature,
+            volume=volume * 1e-3 if boxed else nan, density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
+            stage_name=stage.label, temperature_translation=seen.temperature_translation,
             temperature_rotation=seen.temperature_rotation,
             temperature_translation_unbiased=seen.temperature_translation_unbiased,
-            temperature_rotation_unbiased=seen.temperature_rotation_unbiased,
-            pressure_bar=seen.pressure_bar,
+            temperature_rotation_unbiased=seen.temperature_rotation_unbiased, pressure_bar=seen.pressure_bar,
             drift=conserved - self._sampler.origin(moment.stage, conserved) if known else nan,
-            momentum=hypot(*seen.momentum.tolist()),
-            orthogonality_error=seen.orthogonality_error,
-            a=a,
-            b=b,
-            c=c,
-            alpha=alpha,
-            beta=beta,
-            gamma=gamma,
-            heat=float(ledger[HEAT]),
-            work=float(ledger[WORK]),
-            pressure_xx=xx,
-            pressure_yy=yy,
-            pressure_zz=zz,
-            pressure_xy=xy,
-            pressure_xz=xz,
-            pressure_yz=yz,
-            conserved=conserved,
+            momentum=hypot(*seen.momentum.tolist()), orthogonality_error=seen.orthogonality_error, a=a, b=b, c=c,
+            alpha=alpha, beta=beta, gamma=gamma, heat=float(ledger[HEAT]), work=float(ledger[WORK]), pressure_xx=xx,
+            pressure_yy=yy, pressure_zz=zz, pressure_xy=xy, pressure_xz=xz, pressure_yz=yz, conserved=conserved,
             stage=moment.stage,
             user_energies=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.user_terms),
-        )
+        )  # fmt: skip
 
     def _default_observers(self) -> list[Observer]:
         output = self.scene.output
@@ -482,21 +454,14 @@ class MolecularSimulation(Simulation):
                     return
                 yield f"at step {to}, ", state
 
-    def write_scene(self, folder: Path) -> None:
-        write_scene(folder, self.scene)
-
-    def introduction(self) -> str:
+    @property
+    def _headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
-        first = (
+        return (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
             f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
         )
-        return "\n".join([first, *(f"  {note}" for note in system.notes)])
-
-    def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes of the introduction and the warnings that were issued."""
-        return summary_text(results.summary, [*self.system.notes, *self._issued])
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
         """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².
@@ -508,30 +473,21 @@ class MolecularSimulation(Simulation):
         seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
         force, molecule = seen.largest_force
         found = {
-            "unit": unit,
-            "molecules": len(self.system.model.species),
-            "relief_steps": removal.steps if removal else 0,
+            "unit": unit, "molecules": len(self.system.model.species), "relief_steps": removal.steps if removal else 0,
             "notes": list(self.system.notes),
             "components": {name: energy / size for name, energy in seen.components.items()},
-            "potential": seen.potential / size,
-            "kinetic": seen.kinetic / size,
-            "virial": float(seen.virial.trace()) / size,
-            "virial_tensor": (seen.virial / size).tolist(),
+            "potential": seen.potential / size, "kinetic": seen.kinetic / size,
+            "virial": float(seen.virial.trace()) / size, "virial_tensor": (seen.virial / size).tolist(),
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
-            "largest_force_per_A": force / size,
-            "largest_force_molecule": molecule + 1,
+            "largest_force_per_A": force / size, "largest_force_molecule": molecule + 1,
             "meaning": describe_quantities(self.system),
-        }
+        }  # fmt: skip
         if measure_accuracy:
             error = coulomb_errors(self.system, self.state)
             found["accuracy"] = {
-                "reference": error.reference,
-                "rms_force_per_A": error.force / size,
-                "rms_error_per_A": error.measured / size,
-                "relative": error.relative,
-                "in_e2_per_A2": error.measured / COULOMB,
-                "estimated_per_A": error.estimated / size,
-                "largest_error_per_A": error.largest / size,
-                "energy_error": error.energy / size,
-            }
+                "reference": error.reference, "rms_force_per_A": error.force / size,
+                "rms_error_per_A": error.measured / size, "relative": error.relative,
+                "in_e2_per_A2": error.measured / COULOMB, "estimated_per_A": error.estimated / size,
+                "largest_error_per_A": error.largest / size, "energy_error": error.energy / size,
+            }  # fmt: skip
         return found

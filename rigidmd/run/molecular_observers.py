@@ -157,7 +157,6 @@ class Sampler(Observer):
         self._keep(step, time)
 
     def failed(self, run: "MolecularSimulation") -> str:
-        """Save the last good state."""
         if run.folder is None or self.last_good is None:
             return ""
         path = run.path(LAST_GOOD)

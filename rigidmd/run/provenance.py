@@ -24,14 +24,11 @@ def computed_with() -> dict[str, Any]:
     """Everything besides the scene that may change the bits of a result, as JSON values."""
     settings = " ".join(f"{name}={os.environ[name]}" for name in CODE_SETTINGS if name in os.environ)
     return {
-        **{f"{package}_version": version(package) for package in PACKAGES},
-        "python_version": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-        "processor": PROCESSOR,
-        "processor_features": list(PROCESSOR_FEATURES),
-        "vector_bits": SIMD_BITS,
+        **{f"{package}_version": version(package) for package in PACKAGES}, "python_version": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}", "processor": PROCESSOR,
+        "processor_features": list(PROCESSOR_FEATURES), "vector_bits": SIMD_BITS,
         **({"numba_settings": settings} if settings else {}),
-    }
+    }  # fmt: skip
 
 
 def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: str) -> dict[str, Any]:
@@ -41,15 +38,10 @@ def provenance(scene: Scene, threads: int, inputs: Mapping[str, str], engine: st
     """
     molecular = isinstance(scene, MolecularScene)
     return {
-        "scene": scene.name,
-        **computed_with(),
-        "engine": engine,
-        "threads": threads,
-        "seed": scene.seed if molecular else None,
-        "precision": scene.precision if molecular else "double",
-        "scene_sha256": scene_digest(scene),
-        "input_sha256": dict(inputs),
-    }
+        "scene": scene.name, **computed_with(), "engine": engine, "threads": threads,
+        "seed": scene.seed if molecular else None, "precision": scene.precision if molecular else "double",
+        "scene_sha256": scene_digest(scene), "input_sha256": dict(inputs),
+    }  # fmt: skip
 
 
 def scene_digest(scene: Scene) -> str:

@@ -25,7 +25,6 @@ def describe_quantities(system: System) -> dict[str, str]:
 
 
 def _describe_reaction_field(system: System) -> dict[str, str]:
-    """Explanations of the energies of a reaction field."""
     if system.cutoff == inf or "coulomb" not in system.terms:
         return {}
     name = system.scene.forces.truncation
@@ -59,7 +58,6 @@ def _describe_ewald(system: System) -> dict[str, str]:
 
 
 def _describe_pressure(system: System) -> dict[str, str]:
-    """Explanations of virial and pressure, with the constant parts that they include."""
     virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
     if system.external:
         virial += ", of the forces between molecules; fields, walls and restraints do not contribute"

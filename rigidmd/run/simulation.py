@@ -37,6 +37,7 @@ from rigidmd.io.folder import (
     never_began,
 )
 from rigidmd.io.progress import DisplayArea, announce, is_shown, progress_of
+from rigidmd.io.scene_file import write_scene
 from rigidmd.run.checkpoints import SEGMENT_SECONDS, CheckpointSchedule, checked_walltime
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.options import AnyOptions, BodyOptions, MolecularOptions
@@ -107,12 +108,9 @@ class Simulation(Displayed, Base):
 
     @overload
     def __new__(
-        cls,
-        scene: MolecularScene,
-        folder: str | Path | None = None,
-        force: bool = False,
+        cls, scene: MolecularScene, folder: str | Path | None = None, force: bool = False,
         **options: Unpack[MolecularOptions],
-    ) -> "MolecularSimulation": ...
+    ) -> "MolecularSimulation": ...  # fmt: skip
     @overload
     def __new__(
         cls, scene: BodyScene, folder: str | Path | None = None, force: bool = False, **options: Unpack[BodyOptions]
@@ -129,17 +127,10 @@ class Simulation(Displayed, Base):
         return object.__new__(BodySimulation if isinstance(scene, BodyScene) else MolecularSimulation)
 
     def __init__(
-        self,
-        scene: Scene,
-        folder: str | Path | None = None,
-        force: bool = False,
-        *,
-        observers: Observer | Sequence[Observer] = (),
-        say: Callable[[str], object] | None = None,
-        warn: Callable[[str], object] = _as_warning,
-        resume: bool = False,
-        walltime: float | None = None,
-    ):
+        self, scene: Scene, folder: str | Path | None = None, force: bool = False, *,
+        observers: Observer | Sequence[Observer] = (), say: Callable[[str], object] | None = None,
+        warn: Callable[[str], object] = _as_warning, resume: bool = False, walltime: float | None = None,
+    ):  # fmt: skip
         self.scene = scene
         self.folder = None if folder is None else Path(folder).absolute()  # a callback may change the directory
         self._force = force
@@ -177,7 +168,7 @@ class Simulation(Displayed, Base):
     @property
     def _summary_line(self) -> str:
         where = "results stay in memory" if self.folder is None else f"writes to {self.folder}"
-        return f"{self.introduction().splitlines()[0]}; {where}"
+        return f"{self._headline}; {where}"
 
     def run(self, progress: bool | None = None) -> Results:
         """Run all segments. Raises OutputError (before anything is computed), SimulationError if the run has to stop,
@@ -306,6 +297,18 @@ class Simulation(Displayed, Base):
             raise self._error
         return results
 
+    def introduction(self) -> str:
+        """A few lines for the start of a run."""
+        return "\n".join([self._headline, *(f"  {note}" for note in self.system.notes)])
+
+    def conclusion(self, results: Results) -> str:
+        """The summary as text, without the notes of the introduction and the warnings that were issued."""
+        return self._summary_text(results.summary, [*self.system.notes, *self._issued])
+
+    def write_scene(self, folder: Path) -> None:
+        """Write the scene as it runs, with copies of the files that it reads."""
+        write_scene(folder, self.scene)
+
     # Implemented for molecules and for bodies.
 
     system: "System | BodySystem"
@@ -315,13 +318,12 @@ class Simulation(Displayed, Base):
     time_unit = ""
     engine_version = "rigidmd"
 
-    @abstractmethod
-    def introduction(self) -> str:
-        """A few lines for the start of a run."""
+    _summary_text: Callable[[dict, list[str]], str]  # the summary as text, without these notes
 
+    @property
     @abstractmethod
-    def conclusion(self, results: Results) -> str:
-        """The summary as text, without the notes that the run has printed."""
+    def _headline(self) -> str:
+        """The first line of the introduction."""
 
     @abstractmethod
     def _reset(self) -> None:
@@ -400,10 +402,6 @@ class Simulation(Displayed, Base):
     def _explain(self, error: SimulationError) -> str:
         """An error in full: what was seen, the likely cause, what to try."""
 
-    @abstractmethod
-    def write_scene(self, folder: Path) -> None:
-        """Write the scene as it runs, with copies of the files that it reads."""
-
     def _announce(self, sentence: str) -> None:
         """Print a sentence before something slow."""
         if self._user_say is not None:
@@ -419,7 +417,6 @@ class Simulation(Displayed, Base):
 
     @property
     def notes(self) -> list[str]:
-        """The warnings so far."""
         return list(self._warnings)
 
     @np.errstate(over="ignore", invalid="ignore")

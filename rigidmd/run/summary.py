@@ -68,6 +68,7 @@ def summarise(
     """
     scene = system.scene
     last = samples.row(-1)
+    size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))  # sum of |m v|
     stages = [
         (
             _stage(system, samples, k, times.computing[k], moves.get(k, (0, 0)))
@@ -97,7 +98,7 @@ def summarise(
         "wall_s": times.wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
         "momentum_u_A_ps": last.momentum,
-        "momentum_relative": _relative_momentum(system, state, last.momentum),
+        "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
         "own_forces": dict(system.user_terms),
         "momentum_removed": _momentum_removed(system, state),
@@ -213,9 +214,9 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             found.append(
                 f"stages.{k}: the step of {stage.timestep_fs:g} fs leaves the molecules {abs(heat):.2g} K too "
                 f"{'hot' if heat > 0 else 'cold'}: their temperature{corrected} is "
-                f"{format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the steps it is {level:.4g} K, "
-                f"{', '.join(parts)}, which the thermostat controls. Try timestep_fs = {shorter:.1g}, or integrator = "
-                "'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
+                f"{format_with_error(float(right.mean()), mean_and_error(right)[1])} K; at the steps it is "
+                f"{level:.4g} K, {', '.join(parts)}, which the thermostat controls. Try timestep_fs = {shorter:.1g}, "
+                "or integrator = 'baoab' with thermostat = 'langevin', whose positions have hardly such an error"
             )
     gap, error = mean_and_error(moving - rotating)
     if gap is not None and error is not None and abs(gap) > max(DIFFERENCE_LIMIT * level, STANDARD_ERRORS * error):
@@ -226,13 +227,6 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             "run longer before means are taken"
         )
     return found
-
-
-def _relative_momentum(system: System, state: State, momentum: float) -> float:
-    """|P| over the sum of |m v|."""
-    speed = np.linalg.norm(state.velocity, axis=1)
-    total = float(system.model.mass[system.model.species] @ speed)
-    return momentum / total if total else 0.0
 
 
 def _stage(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
@@ -291,18 +285,11 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
     of_stage = samples.of_stage(k)
     end = Samples(samples.stages, samples.user_terms, of_stage.table()[-1:])
     return dict.fromkeys(MOTION_KEYS) | {
-        "name": stage.label,
-        "ensemble": stage.ensemble,
-        "steps": 0,
-        "duration_ps": 0.0,
-        "computing_s": computing,
+        "name": stage.label, "ensemble": stage.ensemble, "steps": 0, "duration_ps": 0.0, "computing_s": computing,
         "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
-        "pressure_bar": figures["pressure_bar"],
-        **(_box_means(end) if stage.changes_box else {}),
-        "moves_tried": 0,
-        "moves_accepted": 0,
-        "minimum": figures,
-    }
+        "pressure_bar": figures["pressure_bar"], **(_box_means(end) if stage.changes_box else {}), "moves_tried": 0,
+        "moves_accepted": 0, "minimum": figures,
+    }  # fmt: skip
 
 
 def _box_means(of_stage: Samples) -> dict:

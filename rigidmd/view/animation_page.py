@@ -40,19 +40,16 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
 
 
 def read_asset(name: str) -> str:
-    """A script or style of this package."""
     return (HERE / name).read_text(encoding="utf-8")
 
 
 def script(text: str) -> str:
-    """A script of the page."""
     if "</script" in text.lower():
         raise ValueError("the script has the end tag of its element")
     return f"<script>{text}</script>"
 
 
 def data_part(data: dict[str, Any]) -> str:
-    """Data for the scripts of the animation."""
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json" id="film-data">{text}</script>'
 
@@ -73,25 +70,16 @@ def body_part(record: Record, animation: BodyAnimation) -> list[str]:
     """The animation of a body as HTML."""
     flat = partial(packed, kind="<f4")
     data = {
-        "time": packed(animation.time, "<f8"),
-        "quaternion": flat(animation.quaternion),
-        "position": flat(animation.position),
-        "path": flat(animation.path),
-        "when": packed(animation.when, "<f8"),
+        "time": packed(animation.time, "<f8"), "quaternion": flat(animation.quaternion),
+        "position": flat(animation.position), "path": flat(animation.path), "when": packed(animation.when, "<f8"),
         "angles": flat(animation.angles) if animation.angles.size else None,
         "vectors": {name: flat(values) for name, values in animation.vectors.items()},
         "gravity": None if animation.gravity is None else animation.gravity.tolist(),
-        "vertices": animation.mesh.vertices.round(6).tolist(),
-        "faces": animation.mesh.faces,
-        "painted": animation.mesh.painted,
-        "sphere": animation.sphere,
-        "axis": animation.axis.tolist(),
-        "centre": animation.centre.tolist(),
-        "pinned": not record.body.translates,
-        "rod": not animation.mesh.stem,
-        "unit": animation.unit,
-        "azimuth": animation.azimuth,
-    }
+        "vertices": animation.mesh.vertices.round(6).tolist(), "faces": animation.mesh.faces,
+        "painted": animation.mesh.painted, "sphere": animation.sphere, "axis": animation.axis.tolist(),
+        "centre": animation.centre.tolist(), "pinned": not record.body.translates, "rod": not animation.mesh.stem,
+        "unit": animation.unit, "azimuth": animation.azimuth,
+    }  # fmt: skip
     colours = {"L": ("#7a5ca3", "angular momentum L"), "ω": ("#b8862d", "angular velocity ω")}
     legend = "".join(
         f'<span><i class="chip" style="background:{colours[name][0]}"></i>{colours[name][1]}, at most '

@@ -46,7 +46,6 @@ class BodyAnimation(NamedTuple):
 
 
 def animate_body(record: Record) -> BodyAnimation:
-    """The animation of a run of a single body."""
     system, seen = record.body, record.columns
     count = len(record.time)
     stride = -(-count // MOST_SAMPLES)
@@ -217,7 +216,6 @@ class BodyDrawing:
         )
 
     def _scale(self, axes) -> None:
-        """A round length at the lower right."""
         length = 10.0 ** np.floor(np.log10(0.6 * self._animation.unit))
         width = length / self._animation.unit
         axes.plot([1.02 - width, 1.02], [-1.02, -1.02], color=INK, lw=2, solid_capstyle="butt")

@@ -67,7 +67,6 @@ def write_gallery(
 
 
 def _picture(record: Record) -> str:
-    """A picture from the animation, PNG in base64."""
     from rigidmd.figures.picture import Picture
 
     animation = animate_body(record)

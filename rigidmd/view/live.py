@@ -52,11 +52,9 @@ class LivePlot(Observer):
             self._draw()
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        """Draw the last picture, which stays."""
         self._draw()
 
     def failed(self, run: "Simulation") -> str:
-        """Draw the results before the error."""
         self._draw()
         return ""
 

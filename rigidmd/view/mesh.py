@@ -35,7 +35,6 @@ class Mesh(NamedTuple):
 
     @property
     def edges(self) -> list[tuple[int, int]]:
-        """Pairs of vertices that a face joins."""
         sides = {tuple(sorted(side)) for face in self.faces for side in pairwise([*face, face[0]])}
         return sorted(sides)  # pyright: ignore[reportReturnType]
 
@@ -58,7 +57,6 @@ def mesh_of(system: BodySystem) -> Mesh:
 
 
 def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
-    """A solid of given dimensions about a position."""
     size = np.zeros(3)
     for name, axes in SOLIDS[solid.shape].dimensions.items():
         size[axes] = solid.dimensions[name]

@@ -100,15 +100,12 @@ def page_part(record: Record) -> tuple[list[str], list[str]]:
     scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
     data = {
         "time": packed(frames.time, "<f8"),
-        "positions": packed(np.round((positions - low) / scale - LARGEST_INTEGER), "<i2"),
-        "low": float(low),
-        "scale": scale,
-        "steps": LARGEST_INTEGER,
-        "elements": [str(element) for element in sites.element[massive]],
+        "positions": packed(np.round((positions - low) / scale - LARGEST_INTEGER), "<i2"), "low": float(low),
+        "scale": scale, "steps": LARGEST_INTEGER, "elements": [str(element) for element in sites.element[massive]],
         "bonds": massive_bonds(record.molecules),
         "cells": None if frames.cells is None else packed(frames.cells.reshape(-1, 9), "<f4"),
         "name": record.scene.name,
-    }
+    }  # fmt: skip
     count = np.bincount(record.molecules.model.species, minlength=len(record.molecules.species))
     legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, record.molecules.species, strict=True))
     how = (
@@ -207,7 +204,6 @@ class MoleculeDrawing:
                 axes.plot(*corners[[i, j], :2].T, color=FAINT if back else INK, lw=0.8, zorder=1 if back else 3)
 
     def _scale(self, axes) -> None:
-        """A round length at the lower right."""
         span = self._high[0] - self._low[0]
         length = next(x for x in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if x < 0.3 * span or x == 1)
         right, foot = self._high[0] - 0.03 * span, self._low[1] + 0.03 * span

@@ -62,11 +62,9 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     if m.radius > 0:
         lines.append(f"principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
     legend = [
-        (short_source(m), bool(m.source)),
-        ("charges in e", m.charges.any()),
-        ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()),
-        ("diamonds: massless sites", (m.masses == 0).any()),
-    ]
+        (short_source(m), bool(m.source)), ("charges in e", m.charges.any()),
+        ("discs: Lennard-Jones diameters", (m.epsilon > 0).any()), ("diamonds: massless sites", (m.masses == 0).any()),
+    ]  # fmt: skip
     lines.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
     with settings({"svg.hashsalt": m.name}), atomic_file(path) as temporary:
@@ -96,7 +94,6 @@ def _colour(m: Molecule, i: int) -> str:
 
 
 def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
-    """Lennard-Jones diameters, faint."""
     from matplotlib.patches import Circle
 
     for i in np.flatnonzero(m.epsilon > 0).tolist():
@@ -130,7 +127,6 @@ def _order(depth: float) -> float:
 
 
 def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
-    """An atom as a shaded ball, a massless site as a diamond."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Circle, RegularPolygon
 
@@ -189,7 +185,7 @@ def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[
                 centre = spheres[i].centre + way * (spheres[i].radius + gap * half) + way * size / 2
                 box = (*(centre - size / 2), *(centre + size / 2))
                 cost = sum(_overlap(box, other) for other in taken) + sum(_covers(box, s) for s in spheres)
-                cost += 10 * (np.abs([box[:2], box[2:]]).max() > 0.99 * half)
+                cost += 10 * (np.abs(np.array(box)).max() > 0.99 * half)
                 if best is None or cost < best[0]:
                     best = (cost, centre, box, gap)
             if best[0] == 0:
@@ -209,6 +205,5 @@ def _overlap(one: tuple, other: tuple) -> bool:
 
 
 def _covers(box: tuple, sphere: _Sphere) -> bool:
-    """Whether a box lies on a sphere."""
     nearest = np.clip(sphere.centre, box[:2], box[2:])
     return bool(np.linalg.norm(nearest - sphere.centre) < sphere.radius)

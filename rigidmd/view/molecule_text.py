@@ -61,7 +61,6 @@ def molecule_text(m: Molecule) -> str:
 
 
 def _sites(m: Molecule) -> list[str]:
-    """A table of the sites, principal axes."""
     lines = ["  site   element    mass u       x Å       y Å       z Å   charge e   sigma Å  epsilon kJ/mol        K"]
     for i, name in enumerate(m.site_names):
         x, y, z = np.round(m.positions_body[i], 5) + 0.0
@@ -101,7 +100,6 @@ def _geometry(m: Molecule) -> list[str]:
 
 
 def _angle(m: Molecule, i: int, corner: int, j: int) -> float:
-    """Degrees."""
     a, b = (m.positions_body[[i, j]] - m.positions_body[corner]) / [
         [_distance(m, i, corner)],
         [_distance(m, j, corner)],

@@ -35,13 +35,11 @@ TableRow = tuple[str, str]
 
 @html_of.register
 def scene_html(scene: Scene) -> str:
-    """A scene: molecules, box, forces, stages, or the kind, moments, start and method of a body."""
     return _framed(scene.name, _kind(scene), _table(_rows(scene)))
 
 
 @html_of.register
 def simulation_html(simulation: Simulation) -> str:
-    """The scene, the observers, and where the run writes."""
     folder = simulation.folder
     where = "nowhere: the results stay in memory" if folder is None else str(folder)
     user_rows = [
@@ -56,7 +54,6 @@ def simulation_html(simulation: Simulation) -> str:
 
 @html_of.register
 def results_html(results: Results) -> str:
-    """The summary, the first figure of the run, notes, and a list of all columns."""
     summary = results.summary
     text = []
     if isinstance(results.system, BodySystem):
@@ -178,7 +175,6 @@ def _columns(results: "Results") -> str:
 
 
 def _ends(results: "Results", columns: list[str]) -> str:
-    """First and last value of a scalar column, as text."""
     values = results[columns[0]]
     if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
         return ""

@@ -95,11 +95,8 @@ def _frames(results: "Results", system: System, most: int) -> Frames:
     stride = max(1, -(-count // most))
     chosen = results._frames[::stride]
     frames = Frames(
-        time=np.array([frame.time for frame in chosen]),
-        positions=np.array([frame.positions for frame in chosen]),
-        cells=np.array([frame.cell for frame in chosen]) if system.density else None,
-        count=count,
-        stride=stride,
+        time=np.array([frame.time for frame in chosen]), positions=np.array([frame.positions for frame in chosen]),
+        cells=np.array([frame.cell for frame in chosen]) if system.density else None, count=count, stride=stride,
         is_cut=False,
-    )
+    )  # fmt: skip
     return inside(frames, system.sites)

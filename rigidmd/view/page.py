@@ -54,7 +54,6 @@ def _cell(value: object) -> str:
 
 
 def plain(value: object) -> str:
-    """A value as HTML."""
     if isinstance(value, Raw):
         return value
     return "" if value is None else html.escape(str(value))
@@ -69,7 +68,6 @@ def chips(names: Iterable[str]) -> dict[str, Raw]:
 
 
 def items(lines: Iterable[object]) -> str:
-    """A list of sentences."""
     found = "".join(f"<li>{plain(line)}</li>\n" for line in lines)
     return f"<ul>\n{found}</ul>" if found else ""
 
@@ -80,7 +78,6 @@ def notes(lines: Iterable[str]) -> str:
 
 
 def code(text: str) -> str:
-    """Commands or listings."""
     return f"<pre>{html.escape(text)}</pre>"
 
 

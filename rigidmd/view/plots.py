@@ -37,7 +37,6 @@ class Panel(NamedTuple):
 
 
 def panels(record: Record) -> list[Panel]:
-    """The plots of a run."""
     found = _body_panels(record) if record.is_body else _molecular_panels(record)
     return [panel for panel in found if panel.curves]
 
@@ -136,11 +135,9 @@ FIGURE_WIDTH, PANEL_HEIGHT, FIGURE_MARGIN = 7.2, 2.0, 0.6
 
 
 def record_of(
-    system: System | BodySystem,
-    samples: Samples | Motion,
-    summary: dict[str, Any] | None,
+    system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any] | None,
     names: Sequence[str] | None = None,
-) -> Record:
+) -> Record:  # fmt: skip
     """A run in memory as a record, with all its columns or with the named ones and the time."""
     if isinstance(samples, Motion):
         columns = samples.columns if names is None else {name: samples.columns[name] for name in ["time", *names]}

@@ -19,13 +19,10 @@ from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, not
 REPORT = "report.html"
 #: Columns of the table of means: name in the log, title; per molecule or not.
 MEANS = (
-    ("temperature", "T (K)", False),
-    ("temperature_translation", "T_trans (K)", False),
-    ("temperature_rotation", "T_rot (K)", False),
-    ("potential", "U (kJ/mol per molecule)", True),
-    ("pressure_bar", "P (bar)", False),
-    ("density", "density (g/cm³)", False),
-)
+    ("temperature", "T (K)", False), ("temperature_translation", "T_trans (K)", False),
+    ("temperature_rotation", "T_rot (K)", False), ("potential", "U (kJ/mol per molecule)", True),
+    ("pressure_bar", "P (bar)", False), ("density", "density (g/cm³)", False),
+)  # fmt: skip
 #: Keys of a summary on programs, machine and input, and their titles.
 PROVENANCE = (
     ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
@@ -78,7 +75,6 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
 
 
 def _means(record: Record) -> str:
-    """Means of the log with their standard errors."""
     n, seen = len(record.molecules.model.species), record.columns
     shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
     rows = []
@@ -145,7 +141,6 @@ def _number(value: float | None) -> str:
 
 
 def _body_table(record: Record) -> str:
-    """Energy, its errors, and the range of theta."""
     seen, rows = record.columns, []
     rows.append(["time", f"{record.time[-1]:g} s, {len(record.time)} samples"])
     rows.append(["energy", f"{seen['energy'][0]:.9g} J at the start, {seen['energy'][-1]:.9g} J at the end"])
@@ -224,7 +219,6 @@ def _size(size: float) -> str:
 
 
 def _provenance_value(value: object) -> str:
-    """A value of the summary as text; digests of several files in one line."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {digest}" for key, digest in value.items())
     return str(value)

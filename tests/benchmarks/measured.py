@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import Task, analyse_folder
+from support import AnalysisRequest, analyse_folder
 
 from rigidmd import Scene, Simulation
 
@@ -54,8 +54,8 @@ def main() -> None:
     only = options.only
     water = scene(options.model, options.count, options.density, options.duration, options.interval, only)
     Simulation(water, options.output).run(progress=True)
-    done = analyse_folder(options.output, Task(only))
-    for told in [*done.history.notes, *done.findings]:
+    done = analyse_folder(options.output, AnalysisRequest(only))
+    for told in [*done.frames.notes, *done.results]:
         print(told)
 
 

@@ -73,7 +73,6 @@ class _Search:
         return system.methods[trial.integrator].force_evaluations / (trial.timestep * system.time_size)
 
     def walk_square(self, name: str, timestep: float, time: float) -> float:
-        """Mean square of the random walk of the energy."""
         scheme = self.system.methods[name].scheme
         if self.energy_walk is None or not isinstance(scheme, Scheme):
             return 0.0
@@ -198,7 +197,6 @@ def _best_for_duration(search: _Search, first: Trial, duration: float) -> tuple[
 
 
 def round_down(step: float) -> float:
-    """A step rounded down to three digits."""
     unit = 10.0 ** (floor(log10(step)) - 2)
     return float(f"{floor(step / unit) * unit:.3g}")
 

@@ -44,7 +44,6 @@ class EnergyWalk(NamedTuple):
     freedom: int  # degrees of freedom; the energy unit is kT of one of them
 
     def rate(self, scheme: Scheme, dt: float) -> float:
-        """D of an integrator at a step."""
         return self.scale * weight(scheme, self.jump) * dt ** (2 * self.jump + 2)
 
     def square(self, scheme: Scheme, dt: float, time: float) -> float:

@@ -81,7 +81,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     rate = mean_square_rate(system, state, k)
     steps = {}
     for integrator in BIAS:
-        if integrator == "baoab" and not _allows_langevin(stage):
+        if integrator == "baoab" and not (stage.thermostat_is_open or stage.thermostat == "langevin"):
             continue
         decided = _decided(stage, integrator, stage.timestep_fs)
         stable = MAX_STABLE_FRACTION * stable_angle(decided.scheme) / found.rate if found else inf
@@ -96,11 +96,6 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
         f"{sqrt(rate):.3g} rad/ps, the rms frequency of the motions, {BASIS[best]}, not sampled; "
         f"{1 / step:.4g} forces per ps"
     )
-
-
-def _allows_langevin(stage: Stage) -> bool:
-    """Whether the stage has Langevin's thermostat, or names none."""
-    return stage.thermostat_is_open or stage.thermostat == "langevin"
 
 
 def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:

@@ -89,26 +89,16 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
         return errors
 
     return TrialSystem(
-        name=system.scene.name,
-        state=state,
+        name=system.scene.name, state=state,
         methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
         energy=lambda engine, now: observe(system, engine, now).energy - float(now.energy_ledger.sum()),
-        energy_unit="kT per degree of freedom",
-        energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
-        energy_size=freedom * thermal or 1.0,
-        kinetic=kinetic or 1.0,
-        span=span,
-        time_unit="fs",
-        time_size=FEMTOSECOND,
-        length_unit="Å",
-        reference="srkn_6",
-        conserved_errors=conserved_errors,
-        can_continue=True,
+        energy_unit="kT per degree of freedom", energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
+        energy_size=freedom * thermal or 1.0, kinetic=kinetic or 1.0, span=span, time_unit="fs", time_size=FEMTOSECOND,
+        length_unit="Å", reference="srkn_6", conserved_errors=conserved_errors, can_continue=True,
         refused={name: "it is for single bodies" for name in COMPARATORS},
         observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
-        molecules=len(system.model.species),
-        freedom=freedom,
-    )
+        molecules=len(system.model.species), freedom=freedom,
+    )  # fmt: skip
 
 
 def _change(before: np.ndarray, after: np.ndarray) -> float:
@@ -168,24 +158,12 @@ def body_trial_system(
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(schemes, key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations))
     trial_system = TrialSystem(
-        name=scene.name,
-        state=system.state,
-        methods=methods,
-        energy=energy,
-        energy_unit="times the largest kinetic energy",
-        energy_note="",
-        energy_size=kinetic,
-        kinetic=kinetic,
-        span=whole,
-        time_unit="s",
-        time_size=1.0,
-        length_unit="m",
-        reference=reference,
-        conserved_errors=conserved_errors,
-        can_continue=False,
-        refused=refused,
+        name=scene.name, state=system.state, methods=methods, energy=energy,
+        energy_unit="times the largest kinetic energy", energy_note="", energy_size=kinetic, kinetic=kinetic,
+        span=whole, time_unit="s", time_size=1.0, length_unit="m", reference=reference,
+        conserved_errors=conserved_errors, can_continue=False, refused=refused,
         singular=tuple(name for name, (_, form) in COMPARATORS.items() if form == "euler_angles" and at_a_pole),
-    )
+    )  # fmt: skip
     speed = 0.0
     if system.rotates:  # of the body, and of the nutation by its wheels
         inertia, carried = system.moments(np.zeros(1))
@@ -200,7 +178,6 @@ def _reason(error: str, name: str) -> str:
 
 
 def _coarse_motion(system: BodySystem, whole: float) -> Motion:
-    """The motion in this time, with coarse steps."""
     engine = system.engine()
     state = engine.begin(system.state, system.method)
     snapshots, every = [Snapshot(0.0, state.copy())], COARSE_STEPS // COARSE_SAMPLES
@@ -260,12 +237,9 @@ def _fit_step(timestep: float, duration: float, interval: float | None) -> float
 
 
 def _choose_step(
-    trial_system: TrialSystem,
-    longest: dict[str, float],
-    energy: float | None,
-    trajectory: float | None,
+    trial_system: TrialSystem, longest: dict[str, float], energy: float | None, trajectory: float | None,
     duration: float | None = None,
-) -> tuple[str, float, str]:
+) -> tuple[str, float, str]:  # fmt: skip
     if energy is not None:
         found = choose(trial_system, energy, "energy_rms", longest, duration)
     elif trajectory is not None:

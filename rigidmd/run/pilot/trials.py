@@ -51,7 +51,6 @@ class Method(NamedTuple):
 
     @property
     def chooses_steps(self) -> bool:
-        """Whether it has a tolerance, not a time step."""
         return isinstance(self.scheme, Solver) and self.scheme.name != RK4
 
     @property
@@ -128,7 +127,6 @@ class Trial:
 
     @property
     def diverged(self) -> bool:
-        """Whether there are no results."""
         return bool(self.failure)
 
     @property
@@ -167,7 +165,6 @@ class IntegratorAccuracy:
         return min((t for t in self.trials if t.averages), key=lambda t: t.energy_rms)
 
     def stable_step(self, integrator: str) -> float | None:
-        """The longest step tried that did not diverge."""
         steps = [trial.timestep for trial in self.trials if trial.integrator == integrator and not trial.diverged]
         return max(steps, default=None)
 
