@@ -1,4 +1,4 @@
-# A force in plain NumPy: an electric field on rigid waters, into which their dipoles turn.
+# A force in plain NumPy: an electric field on rigid waters, along which their dipoles align.
 import numpy as np
 
 import rigidmd
@@ -7,10 +7,10 @@ E_PER_V_PER_NM = 9.64853321  # an elementary charge in 1 V/nm feels 9.65 kJ/mol/
 
 
 class ElectricField(rigidmd.Force):
-    """A field in V/nm; of neutral molecules, so that the total momentum stays."""
+    """A field in V/nm, which conserves the momentum of neutral molecules."""
 
     changes_momentum = (False, False, False)
-    tied_to_places = False  # moving neutral molecules costs nothing: their box may change
+    tied_to_places = False  # the energy does not depend on positions: the box may change
 
     def __init__(self, field):
         self.field = E_PER_V_PER_NM * np.array(field, float)
@@ -35,4 +35,4 @@ scene = rigidmd.Scene.from_dict(
 results = rigidmd.Simulation(scene, forces=[ElectricField([0, 0, 1.0])]).run()
 half = len(results["electric_field"]) // 2
 print("energy in the field:", results["electric_field"][half:].mean() / 64, "kJ/mol per molecule")
-assert results["electric_field"][half:].mean() < 0  # they turn into the field, as Langevin's function says
+assert results["electric_field"][half:].mean() < 0  # dipoles align with the field, by Langevin's function

@@ -6,7 +6,7 @@ import rigidmd
 
 @rigidmd.analysis.register
 def layers(frames):
-    "share of molecules in the lower half of the box, and spread of their heights (Å)"
+    "fraction of molecules in the lower half of the box, and spread of their heights (Å)"
     height = frames.positions[:, :, 2] % frames.cell[:, 2, 2][:, None]
     return {"lower": (height < frames.cell[:, 2, 2][:, None] / 2).mean(axis=1), "spread": np.std(height, axis=1)}
 

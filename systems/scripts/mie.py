@@ -1,4 +1,4 @@
-# A pair law from a NamedTuple and a function of the distance: a Mie 14-7 fluid.
+# A pair potential from a NamedTuple and a function of the distance: a Mie 14-7 fluid.
 from typing import NamedTuple
 
 import rigidmd
@@ -27,7 +27,9 @@ scene = rigidmd.Scene.from_dict(
         "stages": [{"duration_ps": 2, "timestep_fs": 4}],
     }
 )
-law = rigidmd.pair_law(mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)})  # between Ar and Kr: mean sigma, root of eps
-results = rigidmd.Simulation(scene, forces=[law]).run()
+potential = rigidmd.pair_law(
+    mie, {"Ar": Mie(1.0, 3.4), "Kr": Mie(1.4, 3.65)}
+)  # between Ar and Kr: mean sigma, root of eps
+results = rigidmd.Simulation(scene, forces=[potential]).run()
 print(results["mie"][-1], "kJ/mol; drift", results["drift"][-1])
 assert abs(results["drift"][-1]) < 2e-3 * results["kinetic"][-1]

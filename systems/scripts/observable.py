@@ -1,4 +1,4 @@
-# An observable: the dipole moment of a box of water, seen every 20 fs of the run.
+# An observable: the dipole moment of a box of water, every 20 fs of the run.
 import numpy as np
 
 import rigidmd
@@ -22,5 +22,5 @@ def dipole(moment: rigidmd.Moment) -> np.ndarray:
 
 
 simulation.run()
-print("|M| =", np.linalg.norm(seen, axis=1).mean(), "D on average of", len(seen), "looks")
+print("|M| =", np.linalg.norm(seen, axis=1).mean(), "D on average of", len(seen), "samples")
 assert len(seen) == 26 and np.isfinite(seen).all()
