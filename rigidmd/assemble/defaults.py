@@ -123,7 +123,9 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
         found, faults, grid = _ewald(scene.forces, composition, numbers["cutoff_A"])
         numbers |= found
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
-        faults.append("output.pressure_tensor_interval_ps needs a periodic box: without one there is no pressure")
+        faults.append(
+            "output.pressure_tensor_interval_ps needs a periodic box, without which the pressure is not defined"
+        )
     output = scene.output
     if output.velocities is None:
         can_store = bool(output.trajectory) and output.trajectory.endswith(WITH_VELOCITIES)

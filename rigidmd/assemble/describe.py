@@ -17,7 +17,7 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.io.cells import angles_deg, right_angled
+from rigidmd.io.cells import edges_and_angles, right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
@@ -94,7 +94,7 @@ def _describe_molecules(system: System) -> str:
     if system.space.volume < inf:
         cell = cell_of(system.space)
         edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
-        angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in angles_deg(cell))}°"
+        angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
         lines.append(f"  box: {edges} Å{angles}, {system.density:.4f} g/cm³")
     else:
         lines.append("  no box")

@@ -13,11 +13,11 @@ from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.io.atoms import SAME_MASS, Atoms
 from rigidmd.io.cells import (
-    angles_deg,
     basis_of,
     cell_error,
     describe_basis,
     describe_cell,
+    edges_and_angles,
     least_skewed_cell,
     reduced_cell,
     right_angled,
@@ -149,7 +149,7 @@ def _read_molecules(
         if right_angled(cell):
             upright = np.diag(np.linalg.norm(cell, axis=1))
             if np.abs(upright - cell).max() > ROUNDING * cell.max():
-                angles = ", ".join(f"{x:.7g}" for x in angles_deg(cell))
+                angles = ", ".join(f"{x:.7g}" for x in edges_and_angles(cell)[3:])
                 notes.append(f"its angles of {angles}° were set to right angles")
             cell = upright
         atoms = atoms._replace(cell=cell)

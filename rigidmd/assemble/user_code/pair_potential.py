@@ -310,7 +310,7 @@ def pair_law(
     Raises ValueError.
     """
     if (energy is None) == (table is None):
-        raise ValueError("a pair law needs an energy or a table")
+        raise ValueError("needs an energy or a table")
     if truncation is not None and truncation not in TRUNCATIONS:
         hint = did_you_mean(truncation, TRUNCATIONS)
         raise ValueError(f"truncation is {truncation!r}{hint}; there are {', '.join(TRUNCATIONS)}")
