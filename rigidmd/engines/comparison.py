@@ -79,9 +79,7 @@ def describe_comparison(lines: list[Comparison], there: str) -> str:
     """A table of comparisons; `there` is the name of the other engine."""
     wide = max(len(line.name) for line in lines)
     rows = [f"  {'':<{wide}}  {'rigidmd':>20}  {there:>20}  {'difference':>10}  {'tolerance':>9}"]
-    rows += [
-        f"  {line.name:<{wide}}  {line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g}"
-        f"  {line.tolerance:>9.2g}  {line.unit}{'' if line.agrees else '   <- differs'}"
-        for line in lines
-    ]
+    for line in lines:
+        values = f"{line.here:>20.10g}  {line.there:>20.10g}  {line.difference:>10.2g}  {line.tolerance:>9.2g}"
+        rows.append(f"  {line.name:<{wide}}  {values}  {line.unit}{'' if line.agrees else '   <- differs'}")
     return "\n".join(rows)

@@ -390,10 +390,8 @@ def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
 def _check_arrays(state: State) -> None:
     for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
         if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
-            raise TypeError(
-                f"state.{name} must be a contiguous, writable array of {example.dtype} in C order with "
-                f"{example.ndim} axes (core.state.state_of makes a state of any arrays)"
-            )
+            kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
+            raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
 
 
 class NotFiniteError(SimulationError):

@@ -16,10 +16,8 @@ from rigidmd.errors import SceneError
 
 
 class ExternalEngine(Engine, ABC):
-    """Base of the engines that run another program. A stage of the scene determines the motion.
-
-    Of the tallies of `evaluate`, the first one has the virial of all terms.
-    """
+    """Base of the engines that run another program. A stage of the scene determines the motion. The first tally of
+    `evaluate` has the virial of all terms."""
 
     version: str  # name and version of the program
     moves: tuple[int, int] = (0, 0)  # moves of the box, tried and accepted; (0, 0) if the program does not report them
@@ -85,10 +83,8 @@ def same_state(one: State | None, other: State) -> bool:
 
 
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
-    """The external engine of a scene, for one of its stages.
-
-    Raises SceneError with all features that it lacks, EngineError if it is not installed.
-    """
+    """The external engine of a scene, for one of its stages. Raises SceneError with all features that it lacks, and
+    EngineError if it is not installed."""
     check_supported(system)
     choice = system.scene.engine
     if choice.name == "lammps":

@@ -70,11 +70,6 @@ class ForceFieldView(NamedTuple):
         return np.array([kind.charge for kind in self.kinds])[self.kind]
 
     @property
-    def mass(self) -> np.ndarray:
-        """Masses (s,) in u."""
-        return np.array([kind.mass for kind in self.kinds])[self.kind]
-
-    @property
     def is_body(self) -> np.ndarray:
         """Whether each molecule (n,) is a rigid body that rotates. All others are points or frozen."""
         rotates = np.array([m.inertia.any() for m in self.system.species])

@@ -55,10 +55,8 @@ class MassPoints(NamedTuple):
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
-    """The mass points of a molecule. For a frozen molecule these are all its sites.
-
-    sites : whether sites may be the points if just enough of them have mass
-    """
+    """The mass points of a molecule; all its sites if it is frozen. `sites`: whether sites may be the points if just
+    enough of them have mass."""
     if frozen:
         return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
     mass, position, site = _points(molecule, sites)

@@ -205,10 +205,8 @@ class OdeEngine(Engine):
         self._restart = False
 
     def check(self, state: State, row: Scheme | Solver, dt: float, start: State | None) -> None:
-        """Raise ValueError unless a recalled state agrees with its extra variables.
-
-        start : the start of the run, if forces have not changed since
-        """
+        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
+        forces have not changed since."""
         solver, variables = _as_solver(row), len(state.extra_variables) // 3
         if solver.name != RK4:
             time, length = state.extra_variables[:2]
@@ -337,7 +335,6 @@ def _form(solver: Solver, state: State) -> AttitudeForm:
 class SingularError(SimulationError):
     def __init__(self, theta: float, time: float):
         where = "0" if np.cos(theta) > 0 else "pi"
-        super().__init__(
-            f"the Euler angles became singular at t = {time:.6g}: theta = {theta:.9g} is too near {where}, where phi "
-            "and psi are not defined; use formulation = 'matrix' or 'quaternion', or another integrator"
-        )
+        problem = f"theta = {theta:.9g} is too near {where}, where phi and psi are not defined"
+        hint = "use formulation = 'matrix' or 'quaternion', or another integrator"
+        super().__init__(f"the Euler angles became singular at t = {time:.6g}: {problem}; {hint}")

@@ -36,9 +36,7 @@ class Engine(Protocol):
 
     def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         """Move the state in place, in steps of dt, until its step counter is `until`. Raises SimulationError.
-
-        observed : whether `evaluate_current` follows; affects speed only
-        """
+        `observed`: whether `evaluate_current` follows; affects speed only."""
         ...
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:

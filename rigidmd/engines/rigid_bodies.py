@@ -37,10 +37,8 @@ class RigidBodies:
 
     def state(self, before: State, position: np.ndarray, velocity: np.ndarray, cell: np.ndarray) -> State:
         """The state with sites (s, 3) at these positions, molecules whole and not wrapped; all else as in `before`.
-
         Frozen molecules do not move. The spin of a linear body about its axis has no meaning, so its rotation is the
-        one nearest to `before`.
-        """
+        one nearest to `before`."""
         centre, drift = self._mean(position), self._mean(velocity)
         arm = position - centre[self._molecule]
         rotation, spin = before.rotation.copy(), before.angular_momentum_body.copy()

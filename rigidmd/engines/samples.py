@@ -86,9 +86,7 @@ BODY = {
     "time": Family(("time",), "s", "time"),
     "position": Family(("x", "y", "z"), "m", "centre of mass"),
     "velocity": Family(("vx", "vy", "vz"), "m/s", "its velocity"),
-    "rotation": Family(
-        tuple(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "1", "rotation matrix Q by rows: lab = Q body"
-    ),
+    "rotation": Family(tuple(f"q{i}{j}" for i in "123" for j in "123"), "1", "rotation matrix Q by rows: lab = Q body"),
     "quaternion": Family(("qw", "qx", "qy", "qz"), "1", "Q as a quaternion whose sign does not jump"),
     "euler_angles": Family(("phi", "theta", "psi"), "rad", "Q as Euler angles, 3-1-3"),
     "h_body": Family(tuple(f"h_body_{k}" for k in (1, 2, 3)), "kg m²/s", "angular momentum of wheels, body axes"),
@@ -100,23 +98,15 @@ BODY = {
     "potential": Family(("potential",), "J", "potential energy"),
     "energy": Family(("energy",), "J", "kinetic and potential energy"),
     "work": Family(("work",), "J", "work of drives and resistance: energy - work is conserved"),
-    "energy_error": Family(
-        ("energy_error",), "1", "change of energy - work, as a fraction of the largest kinetic energy"
-    ),
+    "energy_error": Family(("energy_error",), "1", "change of energy - work, relative to the largest kinetic energy"),
     "L_error": Family(
-        tuple(f"L_{k}_error" for k in ("lab", "size", "x", "y", "z", 1, 2, 3)),
-        "1",
-        "change of what is conserved of L, as a fraction of the largest abs(L)",
+        tuple(f"L_{k}_error" for k in ("lab", "size", *"xyz123")), "1", "change of L, relative to the largest abs(L)"
     ),
     "orthogonality_error": Family(("orthogonality_error",), "1", "largest entry of abs(QᵀQ - 1)"),
 }
 #: Additional key of `results[...]` for a body: several columns as one array.
 MATRIX = "Q"
-BODY_COLUMNS = {
-    name: Column("t" if name == "time" else name, family.unit, family.about)
-    for family in BODY.values()
-    for name in family.names
-}
+BODY_COLUMNS = {n: Column("t" if n == "time" else n, f.unit, f.about) for f in BODY.values() for n in f.names}
 
 
 class Samples:

@@ -27,10 +27,8 @@ def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase
 def atoms_of_sites(
     system: System, positions: np.ndarray, velocities: np.ndarray | None, cell: np.ndarray | None, time: float
 ) -> "ase.Atoms":
-    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and `info["time_ps"]`.
-
-    positions, velocities : (s, 3) of all sites, Å and Å/ps; cell : (3, 3) Å, None or infinite without a box
-    """
+    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and `info["time_ps"]`, from
+    positions and velocities (s, 3) of all sites, Å and Å/ps, and a cell (3, 3), None or infinite without a box."""
     import ase
 
     sites = system.sites

@@ -14,10 +14,8 @@ FLAT, THIN = 1e-6, 1e-9
 
 
 def connections(system: System | BodySystem, massless: bool = False) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined.
-
-    massless : whether massless sites are joined to their nearest atoms, so that each molecule is connected
-    """
+    """Pairs (b, 2) of sites that are joined. `massless`: whether massless sites are joined to their nearest atoms, so
+    that each molecule is connected."""
     return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system, massless)
 
 

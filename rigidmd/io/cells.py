@@ -34,10 +34,8 @@ def cell_error(cell: np.ndarray) -> str:
 
 
 def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) to that orientation.
-
-    The new rows are R times the old ones. In a left-handed cell c changes sign, which does not change the lattice.
-    """
+    """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) to that orientation:
+    new rows are R times the old ones. In a left-handed cell c changes sign, which does not change the lattice."""
     cell = cell * np.array([1, 1, np.sign(np.linalg.det(cell))])[:, None]
     longest = np.abs(cell).max()
     if np.abs(np.triu(cell, 1)).max() <= ORIENTED * longest and (np.diag(cell) > 0).all():
@@ -89,11 +87,9 @@ def describe_basis(basis: np.ndarray) -> str:
 
 
 def least_skewed_cell(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (3, 3) of a lattice that allows the longer cutoff, and the rotation (3, 3) to its standard orientation.
-
-    This is the given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cutoff: half the
-    smallest of a_x, b_y, c_z.
-    """
+    """The cell (3, 3) of a lattice that allows the longer cutoff, and the rotation (3, 3) to its standard orientation:
+    the given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cutoff (half the smallest
+    of a_x, b_y, c_z)."""
     from ase.geometry import minkowski_reduce
 
     given = reduced_cell(cell)
@@ -115,11 +111,6 @@ def edges_and_angles(cell: np.ndarray) -> list[float]:
     pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
     angles = [degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs]
     return [*edges, *angles]
-
-
-def angles_deg(cell: np.ndarray) -> list[float]:
-    """alpha, beta, gamma of a cell (3, 3), degrees."""
-    return edges_and_angles(cell)[3:]
 
 
 def pairs_within(

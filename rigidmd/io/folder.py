@@ -24,9 +24,7 @@ SWEEP = "sweep.json"
 
 def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: Iterable[str] = ()) -> None:
     """Raise OutputError if a run cannot be written to a folder, or would remove one of its inputs. Changes nothing.
-
-    names : files that the run will write; existing ones must have been written by an earlier run
-    """
+    `names`: files that the run will write; existing ones must have been written by an earlier run."""
     try:
         exists = folder.exists()
     except OSError as error:  # a name that is too long
@@ -68,10 +66,8 @@ def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> No
 def make_folder(
     folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = (), lock: "FolderLock | None" = None
 ) -> None:
-    """Make the folder of a run that will write these files. Only files that an earlier run wrote are removed.
-
-    lock : taken as soon as the folder exists. Raises OutputError.
-    """
+    """Make the folder of a run that will write these files. Only files that an earlier run wrote are removed. `lock` is
+    taken as soon as the folder exists. Raises OutputError."""
     names = list(names)
     check_folder(folder, force, inputs, names)
     with writing(folder, "made"):
@@ -85,10 +81,8 @@ def make_folder(
 
 
 def continue_folder(folder: Path, names: Iterable[str]) -> None:
-    """Resume in the folder of a run that will also write these files. Its summary is outdated and removed.
-
-    Raises OutputError.
-    """
+    """Resume in the folder of a run that will also write these files. Its summary is outdated and removed. Raises
+    OutputError."""
     add_to_folder(folder, names)
     with writing(folder):
         (folder / SUMMARY).unlink(missing_ok=True)

@@ -50,10 +50,8 @@ def announce(sentence: str, spot: DisplayArea) -> None:
 
 
 def progress_of(total: float, unit: str, shown: bool | None, spot: DisplayArea | None = None) -> "Bar":
-    """A bar for a `with` statement. Its `update` is called with each advance, in `unit` of time.
-
-    shown : None shows it only in a notebook; spot : the area in which a notebook shows it, also at the end
-    """
+    """A bar for a `with` statement. Its `update` is called with each advance, in `unit` of time. `shown`: None shows it
+    only in a notebook. `spot`: the area in which a notebook shows it, also at the end."""
     if not is_shown(shown):
         return Bar(disable=True)
     if in_notebook():

@@ -38,12 +38,10 @@ def universe(system: System | BodySystem, state: State, velocities: bool = False
         len(system.sites.molecule), n_residues=len(names), atom_resindex=system.sites.molecule, trajectory=True,
         velocities=velocities,
     )  # fmt: skip
-    u.add_TopologyAttr("names", system.sites.name)
-    u.add_TopologyAttr("types", system.sites.element)
-    u.add_TopologyAttr("elements", system.sites.element)
-    u.add_TopologyAttr("masses", system.sites.mass)
-    u.add_TopologyAttr("resnames", names)
-    u.add_TopologyAttr("resids", np.arange(1, len(names) + 1))
+    sites = system.sites
+    attributes = {"names": sites.name, "types": sites.element, "elements": sites.element, "masses": sites.mass}
+    for name, values in (attributes | {"resnames": names, "resids": np.arange(1, len(names) + 1)}).items():
+        u.add_TopologyAttr(name, values)
     _connect(u, system, massless=False)  # viewers would draw these bonds
     set_frame(u, system, state, 0.0, 0, velocities, wrapped)
     return u
@@ -111,10 +109,8 @@ class Frames(NamedTuple):
 
 
 def read_frames(path: Path, sites: int, most: int) -> Frames:
-    """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out.
-
-    Raises OutputError if the file cannot be read, or has another number of sites.
-    """
+    """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out. Raises OutputError if
+    the file cannot be read, or has another number of sites."""
     if path.suffix == ".xtc":  # a damaged file crashes the library of its reader
         try:
             read_in_process(path, 0, sites)

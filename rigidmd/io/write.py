@@ -26,10 +26,8 @@ def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]
 def check_target(
     path: Path, extensions: tuple[str, ...], force: bool, what: str = "file", inputs: Iterable[Path] = ()
 ) -> None:
-    """Raise OutputError if a file cannot be written to a path or would replace another one. Changes nothing.
-
-    inputs : files from which it is made, which are never replaced
-    """
+    """Raise OutputError if a file cannot be written to a path or would replace another one. Changes nothing. `inputs`:
+    files from which it is made, which are never replaced."""
     if path.suffix not in extensions:
         raise OutputError(f"{path}: the name of this {what} ends in {' or '.join(extensions)}")
     if path.is_dir():

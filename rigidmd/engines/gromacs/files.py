@@ -161,19 +161,15 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     lines = [f"; {in_comment(system.scene.in_short)}", "; Written by rigidmd.", ""]
     lines += ["[ defaults ]", "; nbfunc comb-rule gen-pairs", "1 2 no", ""]
     lines += ["[ atomtypes ]", "; name mass charge ptype sigma_nm epsilon_kJ_mol"]
-    rows = [(view.sigma[k, k] * NM, view.epsilon[k, k] / KJ_PER_MOL) for k in range(len(kinds))]
-    lines += [
-        f"K{k + 1} {kind.mass:.10g} 0 A {sigma:.12g} {epsilon:.12g} ; {in_comment(kind.name)}"
-        for k, (kind, (sigma, epsilon)) in enumerate(zip(kinds, rows, strict=True))
-    ]
+    sigma, epsilon = view.sigma * NM, view.epsilon / KJ_PER_MOL
+    for k, kind in enumerate(kinds):
+        parameters = f"{kind.mass:.10g} 0 A {sigma[k, k]:.12g} {epsilon[k, k]:.12g}"
+        lines.append(f"K{k + 1} {parameters} ; {in_comment(kind.name)}")
     if any(_extra(m, body) for m, body in zip(system.species, bodies, strict=True)):
         lines += [f"{POINT} 0 0 A 0 0 ; a point with mass alone"]
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
-    lines += [
-        f"K{i + 1} K{j + 1} 1 {view.sigma[i, j] * NM:.12g} {view.epsilon[i, j] / KJ_PER_MOL:.12g}"
-        for i in range(len(kinds))
-        for j in range(i, len(kinds))
-    ]
+    pairs = [(i, j) for i in range(len(kinds)) for j in range(i, len(kinds))]
+    lines += [f"K{i + 1} K{j + 1} 1 {sigma[i, j]:.12g} {epsilon[i, j]:.12g}" for i, j in pairs]
     index, names = system.model.species, distinct([m.name for m in system.species])
     for k in sorted(set(index.tolist())):
         first = int(np.flatnonzero(index == k)[0])

@@ -309,11 +309,9 @@ def _thermo(view: ForceFieldView) -> list[str]:
     constant = view.system.constants.get("coulomb_intramolecular")
     if constant is None:
         return [f"thermo_style custom {columns}"]
-    return [
-        "# pe includes pairs within molecules in reciprocal space, a constant for rigid molecules; potential does not",
-        f"variable potential equal pe+({_n(constant / KCAL)})",
-        f"thermo_style custom {columns} v_potential",
-    ]
+    note = "# pe includes pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
+    potential = f"variable potential equal pe+({_n(constant / KCAL)})"
+    return [note, potential, f"thermo_style custom {columns} v_potential"]
 
 
 def input_script(view: ForceFieldView) -> str:

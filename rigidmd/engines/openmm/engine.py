@@ -157,11 +157,9 @@ class OpenmmEngine(ExternalEngine):
         return None
 
     def _heat(self, state: State) -> float:
-        """Heat from a thermostat, up to a constant: the gain of the energy, u Å²/ps².
-
-        OpenMM computes the energy of a Nosé-Hoover chain, but its velocities are half a step off, so that no conserved
-        energy exists at any one time.
-        """
+        """Heat from a thermostat, up to a constant: the gain of the energy, u Å²/ps². OpenMM computes the energy of a
+        Nosé-Hoover chain, but its velocities are half a step off, so that no conserved energy exists at any one
+        time."""
         if self.conserves_energy:
             return 0.0
         groups = integration_groups(self._particles.view, self._stage)

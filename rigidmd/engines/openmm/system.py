@@ -69,10 +69,8 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
 
 
 def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
-    """A grid for splines of an order with the accuracy of the scene's Ewald sum; None if no grid reaches it.
-
-    It is the grid of the scene if the order of its splines is not higher.
-    """
+    """A grid for splines of an order with the accuracy of the scene's Ewald sum: the grid of the scene if the order of
+    its splines is not higher. None if no grid reaches the accuracy."""
     system, law = view.system, view.coulomb
     pme = system.terms.get("coulomb_reciprocal")
     if isinstance(pme, Pme) and pme.order <= order:
@@ -314,9 +312,7 @@ def _custom(
 
 def _custom_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
     """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6, from tables of kinds.
-
-    Kind 0 of the tables is for mass points without a site.
-    """
+    Kind 0 is for mass points without a site."""
     law = view.lennard_jones
     assert isinstance(law, LennardJones)
     if step:

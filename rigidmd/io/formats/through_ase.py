@@ -76,9 +76,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
 
 def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
     """The frames of a plain or extended .xyz through ASE, which needs elements, while many files have names.
-
-    atom_types : name in the file, such as a type of LAMMPS -> name of the atom
-    """
+    `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
     labels, clean, at = [], [], 0
     while at < len(lines):
         if not lines[at].strip():

@@ -64,14 +64,12 @@ class TrajReader:
             self.sites = len(self._atoms)
             if self.count and MASSLESS in self._file:
                 self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))
-            if not np.array_equal(np.unique(self._atoms), self._atoms) or not self._within():
+            is_inside = not len(self._atoms) or (self._atoms[0] >= 0 and self._atoms[-1] < self.sites)
+            if not np.array_equal(np.unique(self._atoms), self._atoms) or not is_inside:
                 raise ValueError("it is damaged: its indices of atoms are invalid")
         except Exception:  # no file stays open
             self.close()
             raise
-
-    def _within(self) -> bool:
-        return not len(self._atoms) or (self._atoms[0] >= 0 and self._atoms[-1] < self.sites)
 
     def close(self) -> None:
         self._file.close()

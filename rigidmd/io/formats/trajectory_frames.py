@@ -18,10 +18,8 @@ PROGRAM = Path(__file__).with_name("frame_reader.py")
 
 
 def read_trajectory(path: Path, frame: int | None, named: Callable[[], Atoms] | None) -> Atoms:
-    """The atoms of a frame: 1 for the first, -1 or None for the last. Raises StructureError.
-
-    named : returns the atoms of the topology file, for their names; None for a .gsd, which has names
-    """
+    """The atoms of a frame: 1 for the first, -1 or None for the last. `named` returns the atoms of the topology file,
+    for their names; None for a .gsd, which has names. Raises StructureError."""
     frame = -1 if frame is None else frame
     if named is None:
         return _read_gsd(path, frame)
