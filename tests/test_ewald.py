@@ -18,10 +18,10 @@ from support import (
     Engine,
     TabledScreening,
     Triclinic,
-    coulomb_errors,
     build,
     built,
     cell_of,
+    coulomb_errors,
     describe,
     estimated_error,
     ewald_error_notes,
@@ -1015,8 +1015,8 @@ def test_settings_that_make_no_sense(forces, words):
 
 
 @pytest.mark.parametrize(("method", "words"), [
-    ("ewald", "sums over the images of a periodic box, and there is none"),
-    ("pme", "sums over the images of a periodic box, and there is none"),
+    ("ewald", "needs a periodic box; use reaction_field"),
+    ("pme", "needs a periodic box; use reaction_field"),
     ("damped_shifted_force", "needs a cutoff; give forces.cutoff_A"),
 ])  # fmt: skip
 def test_what_needs_a_box_or_a_cut_off_says_so(method, words):

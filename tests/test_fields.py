@@ -434,7 +434,7 @@ def test_check_tells_of_fields_and_of_what_is_left_out():
     assert "electric field, gravity, walls: not in [fields]" in held
     pme = describe(slit({}, forces={"cutoff_A": 6.9, "electrostatics": "pme"}))
     assert "total momentum: removed along x and y every 1 ps" in pme
-    assert "fields.walls: pme sums over the images beyond the walls too" in pme
+    assert "fields.walls: pme includes the periodic images beyond the walls" in pme
 
 
 LJ = {"axis": "z", "kind": "lj93", "positions_A": [0.0, 20.0], "sigma_A": 3.0, "epsilon_kJ_mol": 1.0}

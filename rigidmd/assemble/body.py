@@ -84,11 +84,9 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     if scene.output.trajectory and system.translates:
         reach = system.scale * np.abs(system.state.position).max()
         if not reach < LARGEST_COORDINATE[not_none(scene.output.topology)[-4:]]:
-            fault = (
-                f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold: "
-                "set output.trajectory_A_per_m to less, or output.trajectory = false"
-            )
-            raise SceneError(scene.source, [fault])
+            fault = f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold"
+            advice = "set output.trajectory_A_per_m to less, or output.trajectory = false"
+            raise SceneError(scene.source, [f"{fault}: {advice}"])
     return system
 
 

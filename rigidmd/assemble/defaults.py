@@ -175,9 +175,8 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
     for m in composition.species:
         extent = pdist(m.positions_body).max(initial=0.0)
         if extent > half:
-            faults.append(
-                f"a molecule of {m.name} is {extent:.2f} Å long, more than half {least} of the box, {half:.3f} Å"
-            )
+            longer = f"more than half {least} of the box, {half:.3f} Å"
+            faults.append(f"a molecule of {m.name} is {extent:.2f} Å long, {longer}")
     if start is not None and start >= cutoff:
         faults.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:
@@ -196,10 +195,8 @@ def _electrostatic_errors(forces: Forces, space: Space, cutoff: float) -> list[s
     """Messages on electrostatics that this box does not allow."""
     method = forces.electrostatics
     if method in ("ewald", "pme") and space.volume == inf:
-        return [
-            f"forces.electrostatics = {method!r} needs a periodic box; use reaction_field, which without a box is "
-            "Coulomb's law"
-        ]
+        instead = "use reaction_field, which without a box is Coulomb's law"
+        return [f"forces.electrostatics = {method!r} needs a periodic box; {instead}"]
     if method == "damped_shifted_force" and cutoff == inf:
         return ["forces.electrostatics = 'damped_shifted_force' needs a cutoff; give forces.cutoff_A"]
     screening = {"damped_shifted_force": "damping_per_A", "ewald": "ewald_alpha_per_A", "pme": "ewald_alpha_per_A"}
@@ -238,11 +235,9 @@ def _ewald(
             given = f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
             return numbers, [f"{given} is more than {MOST_K_VECTORS} k-vectors along an edge of the box"], None
         if (count := _number_of_k_vectors(forces, radius, composition.space.volume)) > MOST_K_VECTORS_IN_ALL:
-            fault = (
-                f"forces.electrostatics = 'ewald' needs about {count:.2g} k-vectors, more than "
-                f"{MOST_K_VECTORS_IN_ALL:.2g}: use pme, a lower accuracy, fewer k-vectors or a smaller box"
-            )
-            return numbers, [fault], None
+            fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
+            advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
+            return numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"], None
         return numbers | {"ewald_k_radius_per_A": radius}, [], None
     grid, order, cell = forces.pme_grid, forces.pme_order, cell_of(composition.space)
     if grid is not None and len(set(grid)) > 1 and not composition.has_given_cell:

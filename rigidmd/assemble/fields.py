@@ -58,10 +58,8 @@ def field_terms(scene: MolecularScene, parts: SystemParts) -> dict[str, NamedTup
         if (term := _restraints(scene, k, parts, faults)) is not None:
             terms[f"restraints_{k}"] = term
     if not faults and scene.run.remove_momentum_interval_ps and not conserved_momentum(model, terms).any():
-        faults.append(
-            "run.remove_momentum_interval_ps: fields or frozen molecules change all components of the total momentum; "
-            "leave it out"
-        )
+        why = "fields or frozen molecules change all components of the total momentum; leave it out"
+        faults.append(f"run.remove_momentum_interval_ps: {why}")
     if faults:
         raise SceneError(scene.source, faults)
     return terms

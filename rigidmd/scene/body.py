@@ -200,26 +200,20 @@ class BodyStart(Section):
             error = orthogonality_error(np.array([matrix]))
             sense = np.linalg.det(matrix)
             if self.project and (sense <= 0 or error > FURTHEST_FROM_ROTATION):
-                yield (
-                    f"the matrix is not a rotation with rounded digits: determinant {sense:.3g}, |Q^T Q - 1| is "
-                    f"{error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
-                )
+                what = f"determinant {sense:.3g}, |Q^T Q - 1| is {error:.2g}, must be below {FURTHEST_FROM_ROTATION:g}"
+                yield f"the matrix is not a rotation with rounded digits: {what}"
             elif not self.project and (error > LARGEST_ORTHOGONALITY_ERROR or sense < 0):
                 what = "a reflection" if error <= LARGEST_ORTHOGONALITY_ERROR else f"|Q^T Q - 1| is {error:.2g}"
-                yield (
-                    f"the matrix is not a rotation: {what}, must be below {LARGEST_ORTHOGONALITY_ERROR:g}; "
-                    "project = true uses the nearest one"
-                )
+                limit = f"must be below {LARGEST_ORTHOGONALITY_ERROR:g}; project = true uses the nearest rotation"
+                yield f"the matrix is not a rotation: {what}, {limit}"
         if self.quaternion_wxyz is not None and not any(self.quaternion_wxyz):
             yield "quaternion_wxyz is zero, which is not a rotation"
         if self.euler_rates_rad_s is not None:
             if self.euler_angles_deg is None:
                 yield "euler_rates_rad_s needs euler_angles_deg"
             elif self.euler_angles_deg[1] % 180 == 0:
-                yield (
-                    f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: phi' and psi' rotate about "
-                    "the same axis there; give angular_velocity_body_rad_s"
-                )
+                why = "phi' and psi' rotate about the same axis there; give angular_velocity_body_rad_s"
+                yield f"euler_rates_rad_s with theta = {self.euler_angles_deg[1]:g}: {why}"
 
     @property
     def attitude(self) -> np.ndarray:

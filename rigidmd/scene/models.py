@@ -226,9 +226,8 @@ def molecule(
     name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
 ) -> Molecule:
     """The rigid body of these sites, each of which needs a position and a mass. Raises MoleculeError."""
-    faults = [
-        f"site {s.name}: {key} is missing" for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None
-    ]
+    missing = [(s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None]
+    faults = [f"site {s.name}: {key} is missing" for s, key in missing]
     if len(sites) > MOST_SITES:
         faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
     if faults:

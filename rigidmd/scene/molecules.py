@@ -154,9 +154,9 @@ class Output(Section):
     @model_validator(mode="after")
     def _files_are_consistent(self):
         if self.velocities and (self.trajectory is False or not self.trajectory.endswith(WITH_VELOCITIES)):
+            formats = f"use a {' or '.join(WITH_VELOCITIES)} file"
             raise ValueError(
-                f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; "
-                f"use a {' or '.join(WITH_VELOCITIES)} file"
+                f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; {formats}"
             )
         if self.topology == self.trajectory:
             raise ValueError(f"topology and trajectory are both {self.topology}; give them different names")
