@@ -130,7 +130,7 @@ def user_terms(system: "System") -> UserTerms:
         found.terms[name] = term
     thermostat = found.thermostat
     if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
-        need = "a NamedTuple of a class with rigidmd.compiled_thermostat nor an object that makes one by for_stage(system, k)"
+        need = "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method for_stage(system, k)"
         faults.append(f"thermostat: {thermostat!r:.60} is neither {need}")
     if faults:
         raise SceneError(scene.source, faults)
