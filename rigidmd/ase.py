@@ -194,7 +194,7 @@ class RigidMD(Calculator):
         species = species_of(scene)
         content = scene.embedded_files["structure.file"]
         cell = atoms.cell.array if atoms.pbc.all() else None
-        matched = match(read_atoms(Path("atoms.xyz"), held=content), species, cell, self._tolerance)
+        matched = match(read_atoms(Path("atoms.xyz"), content=content), species, cell, self._tolerance)
         if isinstance(matched, list):
             raise StructureError(SOURCE, matched)
         basis = np.eye(3)

@@ -556,7 +556,7 @@ def test_one_model_in_full(capsys):
         (["tip4"], "did you mean tip4p or tip4p2005"),
         (["--draw"], "need the NAME of a model"),
         (["spce", "-o", "spce.gif"], "ends in .png or .svg or .pdf"),
-        (["spce", "-o", "no/spce.png"], "there is no folder no"),
+        (["spce", "-o", "no/spce.png"], "the folder no does not exist"),
         (["mine.toml"], "there is no such file"),
     ],
 )
@@ -720,7 +720,7 @@ CUT = '2\nLattice="5 0 0 0 5 0 0 0 5"\nN 0.3 0 0\nN 4.3 0 0\n'
         (["--from", "benzene.xyz", "--parameters", "poor.toml"], "atom H: no entry of the table has this name"),
         (["--from", "benzene.xyz", "--name", ""], "name: is ''"),
         (["--from", "benzene.xyz", "-o", "x.png"], "x.png: the name of this model ends in .toml"),
-        (["--from", "benzene.xyz", "-o", "no/x.toml"], "there is no folder no"),
+        (["--from", "benzene.xyz", "-o", "no/x.toml"], "the folder no does not exist"),
         (["--from", "benzene.xyz", "-o", "own.toml"], "own.toml exists; --force replaces it"),
         (["--from", "benzene.xyz", "--parameters", "aromatic.toml", "-o", "aromatic.toml", "--force"],
          "aromatic.toml is an input of this model"),

@@ -1,7 +1,7 @@
 """Observables of molecules at one state: energies, temperatures, pressure, momentum and the orthogonality of Q."""
 
 from math import inf, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -85,16 +85,11 @@ class Observation(NamedTuple):
     def reading(self) -> Reading:
         """The observables in the units of the log."""
         energies = ("potential", "kinetic_translation", "kinetic_rotation", "kinetic", "energy", "virial")
-        values = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
-        return Reading(
-            **values
-            | {name: values[name] / KJ_PER_MOL for name in energies}
-            | {
-                "components": {name: energy / KJ_PER_MOL for name, energy in self.components.items()},
-                "force": self.load.force / KJ_PER_MOL,
-                "torque_body": self.load.torque_body / KJ_PER_MOL,
-            }
-        )
+        values: dict[str, Any] = {name: getattr(self, name) for name in Reading._fields if hasattr(self, name)}
+        values |= {name: values[name] / KJ_PER_MOL for name in energies}
+        values["components"] = {name: energy / KJ_PER_MOL for name, energy in self.components.items()}
+        values |= {"force": self.load.force / KJ_PER_MOL, "torque_body": self.load.torque_body / KJ_PER_MOL}
+        return Reading(**values)
 
     @property
     def largest_force(self) -> tuple[float, int]:

@@ -55,15 +55,15 @@ def read_atoms(
     frame: int | None = None,
     atom_types: dict[str, str] | None = None,
     topology: Path | None = None,
-    held: bytes | None = None,
+    content: bytes | None = None,
 ) -> Atoms:
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
     frame: 1 for the first, -1 for the last; None for the only structure of a file, or the last of a trajectory.
     atom_types: names of types, for formats with types. topology: a file with the names that a trajectory lacks.
-    held: the content, if it does not come from `path`, which is then its name.
+    content: the content of the file, if it is not read from `path`, which is then only its name.
     """
-    if held is None and (reason := unreadable_reason(path)):
+    if content is None and (reason := unreadable_reason(path)):
         raise structure_error(path, reason)
     suffix = path.suffix.lower()
     if suffix in NAMELESS and topology is None:
@@ -76,11 +76,11 @@ def read_atoms(
             path, frame, None if topology is None else partial(read_atoms, topology, None, atom_types)
         )
     else:
-        size = path.stat().st_size if held is None else len(held)
+        size = path.stat().st_size if content is None else len(content)
         if shortage := memory_shortage(FOR_BYTE * size, f"reading its {format_gigabytes(size)}"):
             raise structure_error(path, f"not enough memory: {shortage}")
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            atoms = _choose(path, _frames(path, atom_types, held), frame)()
+            atoms = _choose(path, _frames(path, atom_types, content), frame)()
     if len(atoms.position) == 0:
         raise structure_error(path, "holds no atoms")
     for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):
@@ -146,9 +146,9 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
     return frames[frame - 1 if frame > 0 else frame]
 
 
-def _frames(path: Path, atom_types: dict[str, str] | None, held: bytes | None) -> list[Callable[[], Atoms]]:
+def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None) -> list[Callable[[], Atoms]]:
     """For each structure of a file, a function that reads it."""
-    content = _content(path) if held is None else held
+    content = _content(path) if content is None else content
     name = Path(path.stem if path.suffix.lower() in PACKED else path.name)
     suffix = name.suffix.lower()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))

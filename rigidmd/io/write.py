@@ -33,7 +33,7 @@ def check_target(
     if path.is_dir():
         raise OutputError(f"{path} is a folder; name a file")
     if not path.parent.is_dir():
-        raise OutputError(f"{path} cannot be written: there is no folder {path.parent}")
+        raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
         raise OutputError(f"{path} is an input of this {what}; -o names another file")
     if path.exists() and not force:
