@@ -326,7 +326,7 @@ def test_molecules_with_more_samples_than_there_is_room_for(changes, lines, giga
 
 def a_sample(k: int, own: tuple[float, ...] = ()) -> Sample:
     values = {name: k + column / 64 for column, name in enumerate(COLUMNS)}
-    return Sample(**values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]}, own=own)
+    return Sample(**values | {"step": k, "time": k / 4, "stage": k // 5, "stage_name": "ab"[k // 5]}, user_energies=own)
 
 
 def test_samples_give_back_what_was_added():
@@ -355,8 +355,8 @@ def test_samples_give_back_what_was_added():
     [
         (lambda table: table[:, 1:], "shape"),
         (lambda table: table.ravel(), "shape"),
-        (lambda table: np.where(table == 1.0, 7.0, table), "of stages that the scene does not have"),
-        (lambda table: np.where(table == 1.0, np.nan, table), "of stages that the scene does not have"),
+        (lambda table: np.where(table == 1.0, 7.0, table), "have stages that are not in the scene"),
+        (lambda table: np.where(table == 1.0, np.nan, table), "have stages that are not in the scene"),
         (lambda table: np.where(table == 6.0, 6.5, table), "steps that are not whole numbers"),
         (lambda table: np.where(table == 6.0, 1e300, table), "steps that are not whole numbers"),
         (lambda table: np.where(table == 6.0, np.inf, table), "steps that are not whole numbers"),

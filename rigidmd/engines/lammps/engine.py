@@ -85,7 +85,7 @@ class LammpsEngine(ExternalEngine):
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         self._send(state)
-        load, tallies = self._seen
+        load, tallies = self._evaluated
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
@@ -153,7 +153,7 @@ class LammpsEngine(ExternalEngine):
         n, force = len(energies), dump.rows[:, 10:13] * files.KCAL
         energy = np.array(figures[:n]) * files.KCAL
         tallies = self._tallies(energy, self._virial(figures[n : n + 6], state.volume, position, force), state.volume)
-        self._seen = self._bodies.load(state, position, force), tallies
+        self._evaluated = self._bodies.load(state, position, force), tallies
         # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under rigid/nvt it changed
         # by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
         if self.conserves_energy:

@@ -77,7 +77,7 @@ class OpenmmEngine(ExternalEngine):
         self._groups = {force.getForceGroup() for force in evaluated.getForces()}
         if view.has_ewald_sum:
             self._groups.add(Group.RECIPROCAL)
-        self._seen: tuple[State, Load, dict[str, Tally]] | None = None
+        self._evaluated: tuple[State, Load, dict[str, Tally]] | None = None
 
     def _run(self, state: State, steps: int, dt: float) -> None:
         self._integrator.setStepSize(dt)
@@ -89,12 +89,12 @@ class OpenmmEngine(ExternalEngine):
             raise SimulationError(f"OpenMM stopped: {error}") from None
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        if self._seen is None or not same_state(self._seen[0], state):
+        if self._evaluated is None or not same_state(self._evaluated[0], state):
             position, force = self._forces(state)
             load = self._particles.bodies.load(state, position, force)
             virial = self._virial(state, self._particles.bodies.intramolecular_virial(position, force))
-            self._seen = state.copy(), load, self._tallies(state, virial)
-        _, load, tallies = self._seen
+            self._evaluated = state.copy(), load, self._tallies(state, virial)
+        _, load, tallies = self._evaluated
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
