@@ -208,6 +208,7 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
+    "studies.sweep.sweeping": "format_ranges format_walltime write_slurm_script",
     "view.animation": "_loop_end write_film",
     "view.body_animation": "animate_body",
     "core.shipped": "CHAPTERS DOCS find_example notebooks",
@@ -356,7 +357,6 @@ HOMES = {
     "studies.sweep.cluster": "Cluster",
     "studies.sweep.processes": "Pool",
     "studies.sweep.running": "Waiting code_kind run_points",
-    "studies.sweep.slurm": "format_ranges format_walltime write_script",
     "studies.sweep.table": "SweepRow summarise_run",
     "studies.verify": "verify",
 }

@@ -7,7 +7,7 @@ import argparse
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 
 from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
@@ -90,20 +90,18 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser, commands = _parser()
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
-        suggestion = _did_you_mean(name, commands) or "; `rigidmd --help` lists them"
+        from rigidmd.scene.validation import did_you_mean  # not before it is needed: it loads pydantic
+
+        suggestion = did_you_mean(name, dict.fromkeys(commands)) or "; `rigidmd --help` lists them"
         parser.error(f"unknown command {name!r}{suggestion}")
     options, unknown = parser.parse_known_args(words)
     if unknown and name is not None:
-        known = re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help())
-        suggestion = _did_you_mean(unknown[0].partition("=")[0], known)
+        from rigidmd.scene.validation import did_you_mean
+
+        known = dict.fromkeys(re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help()))
+        suggestion = did_you_mean(unknown[0].partition("=")[0], known)
         commands[name].error(f"unknown argument {unknown[0]!r}{suggestion}")
     return options
-
-
-def _did_you_mean(name: str, known: Iterable[str]) -> str:
-    from rigidmd.scene.validation import did_you_mean  # not before it is needed: it loads pydantic
-
-    return did_you_mean(name, dict.fromkeys(known))
 
 
 def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:

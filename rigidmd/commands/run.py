@@ -23,7 +23,6 @@ def add(commands: Commands) -> None:
 
 
 def add_duration(parser: argparse.ArgumentParser) -> None:
-    """Add --threads, --walltime and --until."""
     parser.set_defaults(writes=True)
     parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
     parser.add_argument(
@@ -37,7 +36,6 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 
 
 def run_scene(options: argparse.Namespace) -> int:
-    """Run or resume a scene."""
     from rigidmd.scene import BodyScene
 
     scene = read_scene(options)

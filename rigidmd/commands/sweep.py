@@ -105,10 +105,11 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
-    """Run what has not finished, and print the results."""
     from rigidmd.io.progress import progress_of
+    from rigidmd.studies.sweep.cluster import Cluster
+    from rigidmd.studies.sweep.processes import Pool
     from rigidmd.studies.sweep.running import SweepOutcome, run_points
-    from rigidmd.studies.sweep.sweeping import collect, jobs_and_threads, runner_of
+    from rigidmd.studies.sweep.sweeping import collect, jobs_and_threads
 
     folder, manifest = sweep.folder, sweep.manifest
     jobs, threads = jobs_and_threads(sweep.left, options.jobs, options.threads, sweep.is_body)
@@ -117,7 +118,10 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     count = len(manifest.points)
     print(f"{manifest.name}: {count} points in {folder}, {count - sweep.left} of them finished before", flush=True)
     if sweep.left:
-        runner = runner_of(folder, options.scheduler, jobs, threads)
+        if options.scheduler is None:
+            runner = Pool(jobs, threads)
+        else:
+            runner = Cluster(options.scheduler, jobs, threads, folder, Path.cwd())
         at_a_time = f"{jobs} at a time" if jobs > 1 else "one at a time"
         where = at_a_time if options.scheduler is None else f"on the cluster {options.scheduler}"
         print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
@@ -152,7 +156,6 @@ class _Listener:
         self._shown: set[str] = set()
 
     def receive(self, name: str, kind: str, value: Any) -> None:
-        """Show a message of the point `name`."""
         from tqdm import tqdm
 
         if kind in ("fraction", "ended", "died"):
@@ -189,7 +192,6 @@ def _print_results(table: "Table", files: list[Path], manifest: "Manifest") -> N
 
 
 def _collect(sweep: "OpenSweep") -> int:
-    """`--collect`."""
     from rigidmd.studies.sweep.sweeping import collect
 
     count = len(sweep.manifest.points)
@@ -200,13 +202,12 @@ def _collect(sweep: "OpenSweep") -> int:
 
 
 def _write_slurm_script(options: argparse.Namespace, sweep: "OpenSweep") -> int:
-    """`--to slurm`."""
-    from rigidmd.studies.sweep.slurm import write_script
+    from rigidmd.studies.sweep.sweeping import write_slurm_script
 
     if not sweep.left:
         print(f"all {len(sweep.manifest.points)} points in {sweep.folder} have finished")
         return _collect(sweep)
-    path, count = write_script(
+    path, count = write_slurm_script(
         sweep.folder, sweep.manifest, options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
     )
     print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")

@@ -57,7 +57,10 @@ def measure_averages(
         raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
-    pairs = [_parse_method(name, stage) for name in methods] if methods else _default_methods(stage)
+    pairs = [_parse_method(name, stage) for name in methods or DEFAULT_METHODS]
+    if not methods:
+        of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
+        pairs = list(dict.fromkeys([*of_stage, *pairs]))
     if not all(0 < length < inf for length in (sample, *(timesteps or []))):
         raise SceneError("accuracy", ["time steps and --sample-ps must be finite and greater than 0"])
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
@@ -135,11 +138,6 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
         error = "--averages needs one temperature and one pressure in the last stage; here they change"
         raise SceneError(scene.source, [error])
     return stage
-
-
-def _default_methods(stage: Stage) -> list[tuple[str, str]]:
-    of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
-    return list(dict.fromkeys([*of_stage, *(_parse_method(name, stage) for name in DEFAULT_METHODS)]))
 
 
 def _parse_method(text: str, stage: Stage) -> tuple[str, str]:

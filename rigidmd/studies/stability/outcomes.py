@@ -96,17 +96,13 @@ class CaseResult:
     @property
     def failures(self) -> list[str]:
         """Undetected errors and crashes, a sentence each."""
-        found = [
-            f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or UNDETECTED}"
-            for t in self.runs
-            if t.verdict in (UNDETECTED, CRASH)
-        ]
-        return found + [
-            f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}: "
-            f"{limit.message or UNDETECTED}"
-            for limit in self.limits
-            if limit.beyond in (UNDETECTED, CRASH)
-        ]
+        runs = [t for t in self.runs if t.verdict in (UNDETECTED, CRASH)]
+        found = [f"{self.name}, {t.setting} {t.family}".strip() + f": {t.outcome.crash or UNDETECTED}" for t in runs]
+        for limit in self.limits:
+            if limit.beyond in (UNDETECTED, CRASH):
+                where = f"{self.name}, {limit.setting} {limit.family}, steps beyond {limit.longest:.3g}"
+                found.append(f"{where}: {limit.message or UNDETECTED}")
+        return found
 
     @property
     def unexpected(self) -> list[CaseRun]:

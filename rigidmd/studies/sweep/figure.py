@@ -54,7 +54,8 @@ def draw_sweep(table: Table, name: str) -> Path | None:
     if not table.keys:
         axis, panels = HorizontalAxis(SEED), [_of_replicas(rows[0], column) for column in shown]
     else:
-        key = _key_of_axis(table)
+        # the first key with numbers, else the first
+        key = next((key for key in table.keys if _is_number([row.values[key] for row in table.rows])), table.keys[0])
         axis, positions = _positions(table, key)
         panels = [SweepPanel(column, _curves(table, rows, key, column, positions)) for column in shown]
     counts = sorted({len(row.runs) for row in rows})
@@ -78,11 +79,6 @@ def _shown(table: Table) -> list[str]:
     if len(there) > MOST_PANELS and DRIFT in there:
         there.remove(DRIFT)
     return there[:MOST_PANELS]
-
-
-def _key_of_axis(table: Table) -> str:
-    """The key along the axis: the first one with numbers, else the first."""
-    return next((key for key in table.keys if _is_number([row.values[key] for row in table.rows])), table.keys[0])
 
 
 def _is_number(values: list[Any]) -> bool:

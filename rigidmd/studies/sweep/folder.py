@@ -96,7 +96,7 @@ def read_manifest(folder: Path) -> Manifest:
     path, remedy = folder / MANIFEST, "; --force begins the sweep anew"
     schema = read_json(path, ManifestVersion, remedy)
     if schema is None:
-        raise OutputError(f"{path} cannot be read: it does not exist")
+        raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
     if schema.schema_ > SCHEMA:
         raise OutputError(
             f"{path}: was written by a later rigidmd (version {schema.schema_} of the format; this one reads {SCHEMA})"

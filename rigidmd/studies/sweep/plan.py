@@ -61,20 +61,15 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
             continue
         if manifest is None:
             varied = [key for together in keys.values() for key in together]
-            common, inputs = common_part(scene, varied, digest)
+            common = keys_of(plain(scene), (*NOT_COMPARED, *varied, *scene.inputs, *scene.embedded_files))
+            # JSON has no infinity
+            common = {key: str(value) if value in (inf, -inf) else value for key, value in common.items()}
+            inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in varied}
             manifest = Manifest(scene.name, str(Path(path).absolute()), keys, fixed, common, inputs)
         manifest.points.append(SweepPoint(point_name(values, short), values, digest.of(scene)))
     if errors or manifest is None:
         raise SceneError(str(path), [_describe_error(error, points, len(every)) for error, points in errors.items()])
     return manifest, isinstance(scene, BodyScene)
-
-
-def common_part(scene: Scene, varied: Sequence[str], digest: "Digests") -> tuple[dict[str, Any], dict[str, str]]:
-    """Keys of a scene and digests of its inputs, without the swept keys."""
-    keys = keys_of(plain(scene), (*NOT_COMPARED, *varied, *scene.inputs, *scene.embedded_files))
-    keys = {key: str(value) if value in (inf, -inf) else value for key, value in keys.items()}  # JSON has no infinity
-    inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in varied}
-    return keys, inputs
 
 
 class Digests:

@@ -174,12 +174,8 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
 
 def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
     """analysis.csv: a line for each combination, its values with their errors."""
-    titles = dict.fromkeys(
-        (result.name, value.name, value.unit)
-        for combination in found
-        for result in combination.results
-        for value in result.values
-    )
+    results = [result for combination in found for result in combination.results]
+    titles = dict.fromkeys((result.name, value.name, value.unit) for result in results for value in result.values)
     keys = list(found[0].values)
     head: list[Any] = [*keys, "runs"]
     for _, name, unit in titles:
@@ -187,9 +183,8 @@ def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> 
         head += [header, f"{header} error"]
     lines = [head]
     for combination in found:
-        values_by_title = {
-            (result.name, value.name, value.unit): value for result in combination.results for value in result.values
-        }
+        both = [(result, value) for result in combination.results for value in result.values]
+        values_by_title = {(result.name, value.name, value.unit): value for result, value in both}
         line: list[Any] = [_cell(combination.values[key]) for key in keys] + [combination.runs]
         for title in titles:
             value = values_by_title.get(title)

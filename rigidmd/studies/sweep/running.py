@@ -24,9 +24,6 @@ TICK, WRITING_INTERVAL = 0.5, 1.0
 SPARE, LEAST = 10.0, 20.0
 SPARE_FRACTION, LEAST_FRACTION = 0.1, 0.2
 
-#: Runs points: processes on this machine, or a cluster.
-Runner = Pool | Cluster
-
 
 @dataclass
 class SweepOutcome:
@@ -42,7 +39,7 @@ class SweepOutcome:
 
 
 def run_points(
-    folder: Path, manifest: Manifest, runner: Runner, walltime: float | None = None, trust: Sequence[str] = (),
+    folder: Path, manifest: Manifest, runner: Pool | Cluster, walltime: float | None = None, trust: Sequence[str] = (),
     receive: Callable[[str, str, Any], object] = lambda name, kind, value: None,
 ) -> SweepOutcome:  # fmt: skip
     """Run what is not finished. A point waits while one that compiles the same code has not begun.

@@ -1,13 +1,16 @@
-"""`rigidmd sweep`: points are checked, the folder is opened, points run, table and figure are written."""
+"""`rigidmd sweep`: its folder is opened, its points run here or by a script for Slurm, its results are written."""
 
 import csv
 import os
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.core.files import write_text
+from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
@@ -15,10 +18,10 @@ from rigidmd.io.write import write_csv
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.axes import Axis, axes_of, check_axes
-from rigidmd.studies.sweep.cluster import Cluster
 from rigidmd.studies.sweep.figure import draw_sweep
 from rigidmd.studies.sweep.folder import (
     FINISHED,
+    SCRIPT,
     SEED,
     TABLE,
     Manifest,
@@ -30,9 +33,29 @@ from rigidmd.studies.sweep.folder import (
 )
 from rigidmd.studies.sweep.plan import merge_manifests, order_axes, read_points, update_state
 from rigidmd.studies.sweep.processes import Pool
-from rigidmd.studies.sweep.running import Runner, run_points, task_of
+from rigidmd.studies.sweep.running import run_points, task_of
 from rigidmd.studies.sweep.table import Table, table_of
 from rigidmd.studies.sweep.worker import PointResult, Send, run_task
+
+#: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this fraction.
+SPARE, SPARE_FRACTION = 300.0, 0.1
+SLURM_SCRIPT = """#!/bin/bash
+# {count} points of {name}. Submit it: sbatch {script}
+# A job whose time is up submits itself again, and continues from its checkpoint. When all have ended,
+#   {collect}
+# writes table and figure; `rigidmd sweep` with --to slurm writes a script of the points that have not finished.
+#SBATCH --job-name={job}
+#SBATCH --array={array}
+#SBATCH --time={time}
+#SBATCH --cpus-per-task={threads}
+#SBATCH --output="{folder}/slurm-%a.out"
+#SBATCH --open-mode=append
+cd {here} || exit 2
+{point} --point "$SLURM_ARRAY_TASK_ID" --threads {threads} --walltime {inner}
+code=$?
+[ $code -eq {again} ] && exec sbatch --array="$SLURM_ARRAY_TASK_ID" {script}
+exit $code
+"""
 
 
 def cores() -> int:
@@ -181,8 +204,6 @@ def run_point(
 
     scene : the scene file; the path in the manifest is not trusted
     """
-    if not is_sweep(folder):
-        raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
     manifest = read_manifest(folder)
     if k >= len(manifest.points):
         raise OutputError(f"{folder} has points 0 to {len(manifest.points) - 1}, not {k}")
@@ -191,8 +212,44 @@ def run_point(
     return point.folder, run_task(task_of(folder, manifest, point, ends_at, trust), send, progress=True)
 
 
-def runner_of(folder: Path, scheduler: str | None, jobs: int, threads: int) -> Runner:
-    """Processes on this machine, or a cluster of dask with `threads` for each point. Raises SettingError."""
-    if scheduler is None:
-        return Pool(jobs, threads)
-    return Cluster(scheduler, jobs, threads, folder, Path.cwd())
+def write_slurm_script(
+    folder: Path, manifest: Manifest, walltime: float, threads: int, trust: Sequence[str], again: int
+) -> tuple[Path, int]:
+    """Write sweep.sbatch for the points that have not finished. Returns its path and their number.
+
+    walltime : wall time of a job, s; again : exit code of a run whose time was up. Raises OutputError.
+    """
+    path = folder.absolute() / SCRIPT
+    left = [k for k, point in enumerate(manifest.points) if point.state != FINISHED]
+    words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
+    for trusted in trust:
+        words += ["--trust", str(Path(trusted).absolute())]
+    here = str(Path.cwd())
+    check_script_paths([*words, str(path), here])
+    text = SLURM_SCRIPT.format(
+        count=len(left), name=in_comment(manifest.name), job=f"{as_word(manifest.name)}-sweep",
+        array=format_ranges(left), threads=threads, time=format_walltime(walltime),
+        inner=format_walltime(walltime - min(SPARE, SPARE_FRACTION * walltime)),
+        folder=str(folder.absolute()).replace("%", "%%"),  # Slurm replaces %j and others
+        here=shlex.quote(here), script=shlex.quote(str(path)), again=again,
+        point=shlex.join(words), collect=shlex.join([*words, "--collect"]),
+    )  # fmt: skip
+    write_text(path, text)
+    return path, len(left)
+
+
+def format_ranges(numbers: Sequence[int]) -> str:
+    """Ascending numbers as Slurm's --array has them: 0-3,7."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in parts)
+
+
+def format_walltime(span: float) -> str:
+    """Seconds as H:MM:SS."""
+    whole = int(span)
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypedDict
 
-from rigidmd.errors import RigidMDError
+from rigidmd.errors import OutputError, RigidMDError
 from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, SweepPoint, state_on_disk
 
 #: Number of progress messages of a run.
@@ -76,8 +76,6 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
     from rigidmd.studies.sweep.plan import Digests
 
     class Begun(Observer):
-        """Sends a message before the first step."""
-
         def begin(self, run: Simulation) -> None:
             send("begun", None)
 
@@ -117,7 +115,6 @@ def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
     """Wait until no other run writes in a folder. Raises OutputError after the timeout."""
     from filelock import FileLock, Timeout
 
-    from rigidmd.errors import OutputError
     from rigidmd.io.folder import LOCK
 
     try:
