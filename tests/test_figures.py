@@ -123,7 +123,7 @@ STEPS = [0, 5, 3, 4, 0, 500]
 def samples_of(rng, start=-1000.0):
     """Samples of a run of STAGES; a minimisation begins far above, and its first stage begins far from its mean."""
     rows, step = [], 0
-    blank = dict.fromkeys(Sample._fields, 0.0) | {"own": ()}
+    blank = dict.fromkeys(Sample._fields, 0.0) | {"user_energies": ()}
     for k, (name, steps) in enumerate(zip(STAGES, STEPS, strict=True)):
         for n in range(steps or 2):
             step += bool(steps)

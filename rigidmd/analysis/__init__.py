@@ -1,8 +1,7 @@
 """Analyses of runs of molecules, as functions of results: `rigidmd.analysis.rdf(results, "OW", "OW")`.
 
-Each returns an `AnalysisResult`: values with errors, and curves. `start` (ps) is the first time used; by default it is
-the end of the equilibration, which is detected. Other options are described in the module of the analysis. They raise
-OutputError.
+Each returns an `AnalysisResult`: values with errors, and curves. `start` (ps) is the first time used, by default the
+detected end of the equilibration. Other options are described in the module of the analysis. They raise OutputError.
 """
 
 from typing import Any

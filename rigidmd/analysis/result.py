@@ -130,8 +130,7 @@ def converged_value(
 
 
 def split_in_blocks(frames: RigidFrames, count: int = BLOCKS) -> list[RigidFrames]:
-    """Frames in parts of equal length, without the first ones if they do not divide; none if parts would have less than
-    two frames."""
+    """Frames in parts of equal length, of at least two frames, without the first ones if they do not divide."""
     size = len(frames) // count
     if size < 2:
         return []
@@ -152,8 +151,7 @@ def with_group_error(
     frames: RigidFrames, kind: Kind, function: Callable[[RigidFrames, Kind], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """An array computed from the molecules of a species, and its standard error: the larger of two, from blocks of
-    frames and from groups of molecules. Blocks are too similar where motion repeats itself, as in a gas, and groups are
-    where molecules move together."""
+    frames and from groups of molecules. Blocks are too similar in a gas, groups where molecules move together."""
     whole, error = with_block_error(frames, lambda part: function(part, kind))
     if (count := min(MAX_GROUPS, len(kind.index))) > 1:
         groups = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))

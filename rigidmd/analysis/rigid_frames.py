@@ -96,8 +96,7 @@ class RigidFrames:
 
     @cached_property
     def paths(self) -> np.ndarray:
-        """Paths of centres (f, n, 3), Å, without the scaling by a barostat: sums of displacements as fractions of the
-        cell, each times the cell at its end."""
+        """Paths of centres (f, n, 3), Å, without scaling by a barostat: sums of displacements in each cell."""
         if not self.has_box or np.ptp(self.cell, axis=0).max() == 0.0:
             return self.positions
         inside = np.einsum("fni,fij->fnj", self.positions, np.linalg.inv(self.cell))
@@ -107,8 +106,7 @@ class RigidFrames:
     def sites(self, name: str, frames: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Positions (f, k, 3) of the sites called `name`, and the indices (k,) of their molecules.
 
-        name : a site's name (HW1, or HW for HW1 and HW2) or element, or a species for its centres of mass. Raises
-        OutputError.
+        name : of a site (HW1, or HW for HW1 and HW2), element, or species (centres of mass). Raises OutputError.
         """
         at, molecules = [], []
         for kind in self.kinds:

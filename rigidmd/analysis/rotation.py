@@ -52,8 +52,7 @@ def _axes(kind: Kind) -> list[int]:
 
 @built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion")
 def orientation(frames: RigidFrames) -> AnalysisResult:
-    """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of the body's principal axes u, their correlation times (ps), and the
-    rotational diffusion about each axis (1/ps).
+    """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational diffusion (1/ps).
 
     Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one. Rotational diffusion is
     the slope of the mean squared rotation about an axis of the body, summed over frames. Raises OutputError.

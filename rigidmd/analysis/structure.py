@@ -31,8 +31,7 @@ BONDING = ("N", "O", "F")
 def rdf(
     frames: RigidFrames, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
 ) -> AnalysisResult:
-    """g(r) of two sites, elements or species (for centres of mass); without names, of all pairs of elements, in a
-    mixture of species.
+    """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in mixtures of species.
 
     g counts pairs of different molecules against the number that there are, so that it is 1 far away in a small box
     too. largest, width : Å. Each frame has its own cell. Raises OutputError.

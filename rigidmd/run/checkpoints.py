@@ -53,8 +53,7 @@ class CheckpointSchedule:
         return self._deadline is not None and clock.monotonic() + needed > self._deadline
 
     def write_once(self, checkpoint: Checkpoint, position: tuple[int, int, bool]) -> None:
-        """Write a checkpoint, unless it is of the same position (segment, step, whether anything was computed in it) as
-        the last one. Raises OutputError."""
+        """Write a checkpoint, unless the position (segment, step, whether steps were computed) is that of the last."""
         self.requested = False
         if self._folder is None or position == self._written:
             return

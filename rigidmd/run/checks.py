@@ -1,7 +1,6 @@
 """Checks that the numbers of a run are still meaningful, and messages if they are not.
 
-No check evaluates forces: the run has states, loads and samples anyway. Only a failed check starts a search for the
-pair of sites that causes it.
+No check evaluates forces: the run has states, loads and samples anyway. A failed check starts a search for its cause.
 """
 
 from collections.abc import Iterable
@@ -274,8 +273,7 @@ def explain(
 ) -> str:
     """The message of a failed check in full: what was observed, the likely cause, what to try.
 
-    states : states to search for overlapping sites, each with words for its time; dt, stable : the step and, if known,
-    the longest stable one, ps
+    states : to search for overlaps, each with a phrase for its time; dt, stable : step and longest stable step, ps
     """
     if isinstance(error, NotFiniteError):
         message = f"{molecule_label(system, error.molecule)} is lost: {error.reason}"

@@ -44,8 +44,7 @@ class Enthalpy:
         rotations scaled by 0.5 and 2 times as much
 
     Axes without inertia do not rotate. The derivative for the strain follows from the molecular virial W = sum F (x) R,
-    dU/dT_ij = -W_ji. Forces between sites are in double precision, because energies in single precision have too few
-    digits near a minimum.
+    dU/dT_ij = -W_ji. Forces are in double precision, as energies need many digits near a minimum.
 
     state : its volume scales the strain
     """

@@ -71,8 +71,7 @@ def coulomb_errors(system: System, state: State) -> CoulombErrors:
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
-    """The estimated rms error of Coulomb forces on sites in another cell (3, 3), u Å/ps², with the k-vectors, grid and
-    alpha of a system that has Ewald sums."""
+    """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charged = [m.charges != 0 for m in system.species]

@@ -19,8 +19,7 @@ from rigidmd.units import BAR, KJ_PER_MOL
 
 #: Stored pairs of moves and changes of the gradient.
 MEMORY = 20
-#: Length of the first move as a fraction of the longest allowed one. As long as no curvature is known, it is doubled
-#: after each move.
+#: Length of the first move as a fraction of the longest allowed one; doubled after each move without known curvature.
 FIRST_MOVE = 0.1
 #: Sufficient decrease: the least gain of a move as a fraction of slope times length (Nocedal & Wright 2006, eq. 3.4).
 DECREASE = 1e-4
@@ -49,8 +48,7 @@ def minimise(
     pressure alone decide on convergence. The change of energy is added to the energy ledger as work.
 
     The optimisers of libraries are not suitable: rotations form no vector space, so each iteration starts from the
-    present orientations, and an unbounded line search can put a charge without repulsion, such as a hydrogen of water,
-    on an opposite charge.
+    present orientations, and an unbounded line search can put a charge without repulsion on an opposite charge.
 
     stop : called before each iteration; the minimisation ends if it is true; advanced : called after each with 1
 

@@ -3,8 +3,7 @@
 All have the same methods: `files` (which it may write), `begin`, `see` (a moment), `end`. `see` is called every
 `interval` of time, counted in steps of each segment, or every `steps` steps, independent of the interval of results,
 and with `ends` also at the last moment of every segment. A time at which a minimisation begins has two states: with
-`once` only the second is observed. No observer depends on the order of observers: data that several of them need belong
-to the moment or the run.
+`once` only the second is observed. No observer depends on another: data that several need belong to the moment or run.
 """
 
 from collections.abc import Callable, Iterable, Sequence

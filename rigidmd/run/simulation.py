@@ -55,8 +55,7 @@ if TYPE_CHECKING:
     from rigidmd.run.body import BodySimulation
     from rigidmd.run.molecular import MolecularSimulation
 
-    # A type checker refuses the call of an abstract class, but `Simulation(scene)` makes one of its complete
-    # subclasses.
+    # Type checkers refuse the call of an abstract class, but `Simulation(scene)` makes one of its subclasses.
     Base = object
 else:
     Base = ABC
@@ -171,11 +170,9 @@ class Simulation(Displayed, Base):
         return f"{self._headline}; {where}"
 
     def run(self, progress: bool | None = None) -> Results:
-        """Run all segments. Raises OutputError (before anything is computed), SimulationError if the run has to stop,
-        CheckpointError if it cannot be resumed.
+        """Run all segments. Raises OutputError (before computing), SimulationError if it fails, CheckpointError.
 
-        progress : whether to show progress: as a bar on a terminal or in a notebook, elsewhere as a line every 30 s on
-            standard error; default: only in notebooks
+        progress : whether to show progress, by a bar or, if not on a terminal, lines every 30 s; default: in notebooks
         """
         scene_file = Path(self.scene.source)
         inputs = [*self.scene.inputs.values(), *([scene_file] if scene_file.is_file() else [])]
@@ -351,8 +348,7 @@ class Simulation(Displayed, Base):
 
     @abstractmethod
     def _restore(self, kept: Checkpoint) -> None:
-        """Return to a checkpoint, instead of `_prepare`. Raises CheckpointError if it is of another scene, ValueError
-        if no run can have written it."""
+        """Return to a checkpoint. Raises CheckpointError if it is of another scene, ValueError if it is invalid."""
 
     def _checked_position(self, kept: Checkpoint) -> RunPosition:
         """The position of a checkpoint, compared with the scene and the state. Raises ValueError."""

@@ -176,8 +176,7 @@ def ewald_error_notes(system: System, state: State) -> list[str]:
 
 
 def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
-    """Notes on signs in the second half of stage k that its averages are wrong: energy that drifts, temperatures that
-    are changed by the step or that differ.
+    """Notes if the averages of stage k may be wrong: if energy drifts, or temperatures change by the step or differ.
 
     A thermostat hides the energy that a long step adds: it removes this energy, faster from some motions than from
     others, and by the temperatures at the steps, which are not the temperatures of the ensemble.

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
 
     from rigidmd.figures.picture import Picture
-    from rigidmd.view.notebook_animation import AnimationPage
+    from rigidmd.view.notebook import AnimationPage
 
 __all__ = ["plot", "show"]
 
@@ -31,6 +31,6 @@ def show(results: Results) -> "StructureWidget | AnimationPage":
 
     Raises ImportError without chemiscope (rigidmd[view]), ValueError without a trajectory.
     """
-    from rigidmd.view.notebook_animation import show_animation
+    from rigidmd.view.notebook import show_animation
 
     return show_animation(results)

@@ -27,8 +27,7 @@ MAX_ROTATION = 0.5
 PANELS = 3
 #: Most frames of molecules that are read.
 MOST_FRAMES = 2000
-#: A motion returns to its start if Q differs by less than this angle (rad), and velocities and position by less than
-#: this fraction of their largest values.
+#: Differences of Q (rad), and of velocities and position, in their largest values, at which a motion has returned.
 RETURN_ANGLE, RETURN_FRACTION = 0.03, 0.02
 
 
@@ -131,8 +130,7 @@ def _rotation_notes(record: Record, times: np.ndarray, seconds: float) -> list[s
 
 
 def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
-    """Put the first plots of the run next to the picture, as an image, as they do not change. Returns (cursor, axis) of
-    each; a cursor is a line of the figure."""
+    """Put the first plots of the run next to the picture, as an image. Returns (cursor line, axis) of each."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.lines import Line2D
 

@@ -67,9 +67,7 @@ def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
 
 
 def _equal_inertia_mesh(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
-    """A homogeneous body of this mass and inertia about its centre: a solid of revolution if two moments are equal,
-    else a cuboid, or what is wanted.
-    """
+    """A homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid."""
     if not tensor.any():
         unit = _ball()
         return Mesh(unit.vertices, unit.faces, unit.painted, "a ball, as it is a point")

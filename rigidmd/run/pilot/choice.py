@@ -28,8 +28,7 @@ HALVINGS = 12
 MARGIN = 0.95
 #: Expected error over a run longer than its pilot runs, in the target: one random walk in ten is 1.5 times as large.
 SAFETY = 0.65
-#: Length of the pilot run of the best step: as a part of the run; least and most, in short pilot runs; how often it
-#: corrects the step.
+#: Length of the pilot run of the best step: part of the run; least and most, in short pilot runs; its repetitions.
 LONG_PILOT_PART, LONG_PILOT_MIN, LONG_PILOT_MAX, CORRECTIONS = 0.05, 10.0, 100.0, 3
 REMEDIES = "truncation = 'smooth_switch', a longer cutoff_A or a shorter stage make the walk of the energy smaller"
 

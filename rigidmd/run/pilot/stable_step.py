@@ -130,8 +130,7 @@ def step_warnings(scene: MolecularScene) -> list[str]:
     """Warnings of time steps that are too long for these molecules in a liquid, without compiled code.
 
     At a temperature T a motion of angular frequency w has the rms amplitude sqrt(kT/m)/w. So a step is unstable if a
-    molecule at its thermal speed sqrt(kT/m) moves in it by more than `stable_angle` such amplitudes; the same holds
-    for the rotation about its lightest axis.
+    molecule at its thermal speed sqrt(kT/m) moves or rotates in it by more than `stable_angle` such amplitudes.
     """
     warnings = []
     species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]

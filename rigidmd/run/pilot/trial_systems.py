@@ -48,8 +48,7 @@ def _on_rotor(name: str, rotor: str | None) -> Scheme:
 def natural_time(system: System, state: State) -> float | None:
     """Time (ps) of one radian of the faster of vibration and libration; None at rest.
 
-    Its inverse squared is <F²/m> / <m v²>, the mean square frequency of a harmonic motion in equilibrium; likewise for
-    torques.
+    Its inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion; likewise for torques.
     """
     engine = system.engine()
     load, _ = engine.evaluate(state)

@@ -34,8 +34,7 @@ SAMPLING_INTERVAL_PS = 0.02
 STABLE_FRACTION = 0.8
 #: Least steps in a span of a trial that extends the steps of an integrator.
 MIN_STEPS = 4
-#: Steps that warm up an engine: they build lists, grow buffers and touch memory. The first 25 steps of 216 waters took
-#: 40 ms, the next 25 took 20 ms.
+#: Steps that warm up an engine (lists, buffers, memory): the first 25 steps of 216 waters took 40 ms, the next 20 ms.
 WARM_UP = 10
 #: Least seconds of computing in the timing of a span.
 TIMING_SECONDS = 0.2
@@ -73,8 +72,7 @@ class TrialSystem:
     reference : name of the method of the reference
     conserved_errors : relative errors of other conserved quantities, of a state
     can_continue : whether timing may continue beyond the span instead of starting again
-    refused : name -> reason for methods that cannot move this system; singular : names of methods whose variables do
-        not exist at the start
+    refused : name -> reason, of methods that cannot move this system; singular : names of those singular at the start
     observe : the averaged observables of molecules in a box; None for others
     rounding : relative rms errors of forces and torques in mixed precision; None in double
     """
