@@ -327,7 +327,7 @@ HOMES = {
     "run.report": "summary_text",
     "io.run_files": "Summary read_json",
     "io.scene_file": "write_scene",
-    "studies.sweep.folder": "Manifest point_name read_manifest short_keys value_name write_manifest",
+    "studies.sweep.folder": "Manifest SweepPoint point_name read_manifest short_keys value_name write_manifest",
     "io.trajectory": "from_files in_memory read_frames",
     "io.trajectory_writer": "GsdFile TrajectoryFile open_trajectory write_topology",
     "engines.rigid_bodies": "RigidBodies",

@@ -8,7 +8,7 @@ import subprocess
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from support import Manifest, Point, build, force_field_of, gromacs_files, lammps_files, write_script
+from support import Manifest, SweepPoint, build, force_field_of, gromacs_files, lammps_files, write_slurm_script
 
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.scene import Scene
@@ -128,9 +128,9 @@ def test_names_change_no_statement_of_the_script_for_openmm(usual, tmp_path, nam
 
 
 def script(folder, name, scene, trust):
-    points = [Point(f"p{k}", {}, "") for k in range(3)]
+    points = [SweepPoint(f"p{k}", {}, "") for k in range(3)]
     folder.mkdir(parents=True, exist_ok=True)
-    path, _ = write_script(folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75)
+    path, _ = write_slurm_script(folder, Manifest(name, scene, {}, {}, {}, {}, points), 3600.0, 1, trust, 75)
     return path.read_text()
 
 
