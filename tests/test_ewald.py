@@ -1027,7 +1027,7 @@ def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
 def test_a_charged_box_is_said_and_has_no_dipole():
     system, _, _ = salty([13.0, 14.0, 15.0], TIGHT_EWALD)
     assert any("net charge of +6 e" in note for note in system.notes)
-    with pytest.raises(SceneError, match="a box with a net charge has no dipole of its own"):
+    with pytest.raises(SceneError, match="the dipole of a box with a net charge is not defined"):
         salty([13.0, 14.0, 15.0], TIGHT_EWALD, ewald_surface_permittivity=2.0)
 
 
@@ -1036,7 +1036,7 @@ def test_check_says_how_and_what_is_left_out():
     text = describe(small_scene({"spce": 20}, 13.0, forces=water))
     assert "splines of order" in text and "estimated rms error of the force on a site" in text
     text = describe(small_scene({"spce": 20}, 13.0, forces=water | {"electrostatics": "ewald"}))
-    assert "waves, |n| up to" in text and "Fourier transforms: electrostatics is ewald" in text
+    assert "k-vectors, |n| up to" in text and "Fourier transforms: electrostatics is ewald" in text
     assert "Fourier transforms: electrostatics is reaction_field" in describe(small_scene({"spce": 20}, 18.1))
 
 

@@ -473,7 +473,7 @@ NO_BOX = {"box": {"lengths_A": 30.0, "periodic": False}}
         ({"walls": [LJ | {"positions_A": [0.0, 5.0]}]}, {}, "the walls across z leave no space for molecules"),
         ({"walls": [LJ]}, {"molecules": [{"name": "bare", "count": 2, "sites": [site("Q", 5.0, [0, 0, 0], 1.0)]}]},
          "bare has no site with Lennard-Jones parameters, and would pass the walls; use acts_on = 'centres'"),
-        ({"walls": [LJ]}, {"forces": {"tail_correction": True}}, "between walls leave it out"),
+        ({"walls": [LJ]}, {"forces": {"tail_correction": True}}, "omit it between walls"),
         ({"restraints": [{}]}, {}, "fields.restraints.0.stiffness_kJ_mol_A2: is missing"),
         ({"restraints": [{"stiffness_kJ_mol_A2": [0.0, 0.0, 0.0]}]}, {}, "stiffness_kJ_mol_A2: is 0: it would do nothing"),
         ({"restraints": [HELD | {"molecules": "3-1"}]}, {}, "fields.restraints.0.molecules: is '3-1': 3-1 ends before"),
