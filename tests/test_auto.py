@@ -231,7 +231,7 @@ def test_contradictions_are_refused(stage, fault):
 
 def test_check_says_that_it_is_open(capsys):
     assert main(["check", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-6"]) == 0
-    assert "the integrator is chosen before the run" in capsys.readouterr().out
+    assert "are chosen before the run" in capsys.readouterr().out
     water = str(ROOT / "systems" / "water.toml")
     more = ["--set", "stages.1.integrator=auto", "--set", "stages.1.energy_error_kT=1e-4"]
     assert main(["check", water, *more, "--set", "stages.1.timestep_fs=2.0"]) == 0

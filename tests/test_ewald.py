@@ -467,7 +467,7 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     assert found["coulomb_reciprocal"] == pytest.approx(oracle.reciprocal, rel=1e-9)
     data["forces"] = {"cutoff_A": 6.0, "electrostatics": "pme", "pme_grid": [16, 20, 24]}
     with pytest.raises(
-        SceneError, match=r"pme_grid = \[16, 20, 24\] counts points .*edges 14.0000, 14.0000, 14.0000 Å"
+        SceneError, match=r"pme_grid = \[16, 20, 24\] refers to the edges .*edges 14.0000, 14.0000, 14.0000 Å"
     ):
         build(Scene.from_dict(data, tmp_path))
     data["forces"]["pme_grid"] = [20, 20, 20]
