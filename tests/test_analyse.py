@@ -680,10 +680,10 @@ def test_a_viscosity_needs_stresses_long_enough_and_close_enough():
     for lines, words in (
         (None, "needs the pressure tensor"),
         (tensor[:1], "needs the pressure tensor"),
-        (tensor[:990], r"at least; there are 19.8 ps of it"),
-        (tensor[np.r_[:500, 600:2000]], "at equal times"),
-        (tensor[::10], "0.2 ps apart are too far apart"),
-        (tensor[::100], "2 ps apart are too far apart"),
+        (tensor[:990], r"tensor; there are 19.8 ps"),
+        (tensor[np.r_[:500, 600:2000]], "at equal intervals"),
+        (tensor[::10], "an interval of 0.2 ps of the pressure tensor is too long"),
+        (tensor[::100], "an interval of 2 ps of the pressure tensor is too long"),
     ):
         with pytest.raises(OutputError, match=words):
             viscosity(history(system, time, None, box, tensor=lines))

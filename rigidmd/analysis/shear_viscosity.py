@@ -90,7 +90,7 @@ def viscosity(frames: RigidFrames) -> AnalysisResult:
     if whole is None or grows or len(resampled) < DRAWS // 2:
         note = (
             f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps, too short for a value; "
-            f"a run of {4 * gaps.sum():.3g} ps is four times as long. "
+            f"a run of {4 * gaps.sum():.3g} ps follows it four times as far. "
             f"{describe_so_far(mean[end - 1], scatter[end - 1] / np.sqrt(len(running)), 'mPa s')}"
         )
         found.values.append(Value("viscosity", "mPa s", None, None, None, note))

@@ -53,7 +53,10 @@ class CheckpointSchedule:
         return self._deadline is not None and clock.monotonic() + needed > self._deadline
 
     def write_once(self, checkpoint: Checkpoint, position: tuple[int, int, bool]) -> None:
-        """Write a checkpoint, unless the position (segment, step, whether steps were computed) is that of the last."""
+        """Write a checkpoint, unless the last one has the same position: segment, step, whether steps were computed.
+
+        Raises OutputError.
+        """
         self.requested = False
         if self._folder is None or position == self._written:
             return
