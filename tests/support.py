@@ -236,7 +236,7 @@ HOMES = {
     "dynamics.momenta": "draw_momenta mobile remove_momentum",
     "assemble.overlaps": "close_pairs every_site",
     "assemble.memory_check": "array_bytes",
-    "assemble.stage_flows": "thermostat_of barostat_of",
+    "assemble.stage_flows": "barostat_of integrator_of_stage thermostat_of",
     "assemble.structure": "read_structure",
     "io.structure_file": "read_atoms read_geometry",
     "io.ase_atoms": "EV",

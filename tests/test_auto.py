@@ -15,11 +15,11 @@ from support import (
     Method,
     TrialSystem,
     _fit_step,
-    averages,
     bias_of_potential,
     choice,
     choose,
     mean_square_rate,
+    measure_averages,
     small_scene,
     springs,
     start_of_last_stage,
@@ -292,7 +292,7 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
     scene = small_scene({"spce": 64}, 12.42, forces={"cutoff_A": 6.0}, stages=stages)
     _, state = start_of_last_stage(scene)
     rate = mean_square_rate(MolecularSimulation(scene).system, state, 1)
-    found = averages(scene, ["velocity_verlet", "baoab"], [2.0, 4.0, 5.0], sample=200.0)
+    found = measure_averages(scene, ["velocity_verlet", "baoab"], [2.0, 4.0, 5.0], sample=200.0)
     potential = found.quantities[0]
     for run in found.runs:
         if run.timestep == 5.0:

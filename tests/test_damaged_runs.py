@@ -11,17 +11,17 @@ from support import (
     ANALYSIS,
     ROOT,
     Manifest,
-    Point,
     Summary,
+    SweepPoint,
     compare,
-    read_results,
+    describe_run_comparison,
     read_json,
     read_manifest,
     read_record,
+    read_results,
     write_manifest,
     write_report,
 )
-from support import describe_run_comparison
 
 from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
@@ -166,7 +166,7 @@ def test_any_value_of_an_analysis(argon, tmp_path):
 
 
 def test_any_value_of_a_manifest(tmp_path):
-    points = [Point(f"p{k}", {"seed": k}, "0" * 64) for k in range(2)]
+    points = [SweepPoint(f"p{k}", {"seed": k}, "0" * 64) for k in range(2)]
     write_manifest(tmp_path, Manifest("s", "s.toml", {"seed": ["seed"]}, {"a.b": 1}, {"c": [1]}, {"file": "0"}, points))
     data = json.loads((tmp_path / "sweep.json").read_text())
     assert read_manifest(tmp_path).points == points
