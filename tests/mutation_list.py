@@ -112,8 +112,8 @@ RINGS = [
     Mutation(
         "B1", "Monte Carlo barostat: a scene passes N + 1 for N",
         "assemble/stage_flows.py",
-        "float(mobile(system.model).sum()), beyond, key",
-        "float(mobile(system.model).sum()) + 1.0, beyond, key",
+        "float(mobile(system.model).sum()), tail_terms, key",
+        "float(mobile(system.model).sum()) + 1.0, tail_terms, key",
         ("test_wiring.py::test_a_monte_carlo_barostat_counts_the_molecules",),
     ),
     Mutation(

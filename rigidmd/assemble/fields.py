@@ -113,14 +113,14 @@ def _gap_errors(scene: MolecularScene, parts: SystemParts, moves: np.ndarray) ->
         if (bounds := fields.bounds(axis)) is None:
             continue
         across = [walls for walls in fields.walls if walls.direction == axis]
-        over = min(_protrusion(walls, parts.species, moves) for walls in across)
+        protrusion = min(_protrusion(walls, parts.species, moves) for walls in across)
         width, edge = bounds[1] - bounds[0], space.edges[axis]
-        least = width + 2 * over + parts.cutoff
+        least = width + 2 * protrusion + parts.cutoff
         if edge < least:
-            beyond = f", {2 * over:.3g} Å by which sites may protrude," if over else ""
+            sites = f", {2 * protrusion:.3g} Å by which sites may protrude," if protrusion else ""
             faults.append(
                 f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at least: {width:g} Å "
-                f"between the walls{beyond} and the cutoff of {parts.cutoff:g} Å, so that molecules at one wall do not "
+                f"between the walls{sites} and the cutoff of {parts.cutoff:g} Å, so that molecules at one wall do not "
                 "interact with periodic images of molecules at the other"
             )
     return faults

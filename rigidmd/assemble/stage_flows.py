@@ -60,18 +60,20 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     first, last = stage.pressures
     pressure = Pressure(_scaled(first, BAR), _scaled(last, BAR), float(stage.steps))
     tail = system.tail
-    beyond = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
+    tail_terms = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
     compressibility, volume = stage.compressibility / BAR, system.state.volume
     if stage.ensemble == "nph":
-        return piston(pressure, stage.barostat_time, compressibility, volume, beyond)
+        return piston(pressure, stage.barostat_time, compressibility, volume, tail_terms)
     if stage.barostat_kind == "monte_carlo":
         spread = np.sqrt(BOLTZMANN * max(stage.temperatures) * compressibility * volume)
         return VolumeMoves(
-            _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), beyond, key
+            _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), tail_terms, key
         )
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     rate = compressibility / stage.barostat_time
-    return CellRescaling(_thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], (x, y, z), beyond, key)
+    return CellRescaling(
+        _thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], (x, y, z), tail_terms, key
+    )
 
 
 def _scaled(tensor: Six, factor: float) -> Six:
