@@ -86,7 +86,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     assert set(found) == set(registry.ORDER)
     left_out = [name for name, entry in found.items() if not entry["curves"] and not entry["values"]]
     assert left_out == ["viscosity"]
-    assert "viscosity: skipped: a viscosity needs 20 ps of the pressure tensor at least; there are 0.2 ps" in text
+    assert "viscosity: skipped: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps" in text
     files = [name for entry in found.values() for name in entry["files"]]
     assert sorted([*before, "analysis.json", *files]) == names(copy)
     assert set(files) <= set((copy / ".rigidmd-run").read_text().split("\n"))  # which a new run removes
@@ -270,10 +270,10 @@ def test_the_total_dipole_is_that_of_gromacs(water, topology):
     [
         (["--only", "rfd"], "unknown analysis 'rfd'; did you mean rdf? there are"),
         (["--only", "viscosty"], "did you mean viscosity?"),
-        (["--from", "1ns"], "from 1000 ps on there are 0 of 56 frames; an analysis needs two at least"),
+        (["--from", "1ns"], "from 1000 ps on there are 0 of 56 frames; an analysis needs at least two"),
         (["--from", "0.22ps"], "from 0.22 ps on there is 1 of 56 frames"),
         (["--only", "diffusion", "--from", "0.1ps"], "a diffusion coefficient needs at least 40 frames; there are"),
-        (["--only", "viscosity"], "a viscosity needs 20 ps of the pressure tensor at least"),
+        (["--only", "viscosity"], "a viscosity needs at least 20 ps of the pressure tensor"),
         (["--trust", "nowhere.py"], "nowhere.py: "),
     ],
 )
@@ -349,8 +349,8 @@ def test_a_folder_that_is_no_run_of_molecules(tmp_path, copy, capsys):
     top = tmp_path / "top"
     body = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.figures": False})
     results = Simulation(body, top).run()
-    assert "is the run of a single body, and analyses are of molecules" in said(capsys, top)
-    with pytest.raises(OutputError, match="this is the run of a single body, and analyses are of molecules"):
+    assert "is a run of a single body, and analyses are for molecules" in said(capsys, top)
+    with pytest.raises(OutputError, match="this is a run of a single body, and analyses are for molecules"):
         rigidmd.analysis.rdf(results)
 
 
@@ -519,7 +519,7 @@ def text_run(tmp_path_factory):
         (lambda frames: [*frames[:9], [frames[9][0].replace("648", "647"), *frames[9][1:-1]], *frames[10:]], "frame 10 of 16 is not one of 648 sites"),
         (lambda frames: [*frames[:9], [*frames[9][:2], "OW nan 0 0", *frames[9][3:]], *frames[10:]], "not finite numbers"),
         (lambda frames: [*frames[:9], [*frames[9][:2], "OW 900.0 0 0", *frames[9][3:]], *frames[10:]], "frame 5: a site of molecule 1 is"),
-        (lambda frames: frames[:6], "from 0.02 ps on there is 1 of 6 frames; an analysis needs two at least"),
+        (lambda frames: frames[:6], "from 0.02 ps on there is 1 of 6 frames; an analysis needs at least two"),
         (lambda frames: [*frames[:9], *frames[10:]], "needs frames at equal intervals; these are 0.004 to 0.008 ps"),
     ],
     ids=["number", "nan", "torn", "one", "uneven"],

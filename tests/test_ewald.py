@@ -842,9 +842,9 @@ def test_what_energy_says_of_its_figures():
 @pytest.mark.parametrize(
     ("truncation", "words"),
     [
-        ("plain", "q q (1/r + k r²) up to the cut-off"),
-        ("switch", "q q (1/r + k r²) up to the cut-off, less its value at the cut-off, times switch from 5.4 Å on"),
-        ("force_switch", "q q (1/r + k r²) up to the cut-off, its force switched off from 5.4 Å on"),
+        ("plain", "q q (1/r + k r²) up to the cutoff"),
+        ("switch", "q q (1/r + k r²) up to the cutoff, less its value at the cutoff, times switch from 5.4 Å on"),
+        ("force_switch", "q q (1/r + k r²) up to the cutoff, its force switched off from 5.4 Å on"),
     ],
 )
 def test_what_energy_says_of_a_reaction_field(truncation, words, capsys, tmp_path):

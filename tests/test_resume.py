@@ -292,7 +292,7 @@ BROKEN = {
     "a linked log": (lambda run: linked(run / "log.csv"), [], "log.csv: is a link"),
     "a linked trajectory": (lambda run: linked(run / "trajectory.xtc"), [], "trajectory.xtc: is a link"),
     "a piped log": (lambda run: piped(run / "log.csv"), [], "log.csv: is a pipe, a socket or a device"),
-    "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "longer already"),
+    "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "already longer"),
     "another seed": (lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"), [], "seed is 2, there 1"),
     "a figure of another": (
         lambda run: [change(run / "scene.toml", "figures = false", "figures = true"), (run / "energy.png").touch()],
