@@ -56,8 +56,9 @@ Precision = Literal["double", "mixed"]
 #: Owners of arrays in `Engine.memory` besides the terms, and the arrays of each.
 LOAD, BOX = "load", "box"
 MEMORY_FIELDS = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
+
 #: dt, `until` and `observed` of `Engine.advance`.
-StepArguments = tuple[float, int, bool]
+Steps = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
 #: Relative difference of forces and virials between two machines, by arithmetic.
 ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
@@ -113,7 +114,7 @@ class Engine:
         self._moved: State | None = None
         self._observed_load: Load | None = None  # returned by the last `evaluate_current`
         self._advance: tuple[tuple, Advance] | None = None  # with the objects that it is bound to
-        self._row: tuple[Scheme, tuple] | None = None
+        self._bound_flows: tuple[Scheme, tuple] | None = None
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
@@ -129,16 +130,16 @@ class Engine:
     def forget(self) -> None:
         self._stale = True
 
-    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+    def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
-        row = _as_scheme(row)
-        return np.zeros(getattr(row.thermostat, "variables", 0) + isinstance(row.barostat, Piston))
+        integrator = _as_scheme(integrator)
+        return np.zeros(getattr(integrator.thermostat, "variables", 0) + isinstance(integrator.barostat, Piston))
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
-        return state.copy()._replace(extra_variables=self.variables(state, row))
+    def begin(self, state: State, integrator: Scheme | Solver) -> State:
+        return state.copy()._replace(extra_variables=self.variables(state, integrator))
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
-        row = _as_scheme(row)
+    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+        integrator = _as_scheme(integrator)
         workspaces = self._prepare(state)
         keep_time(state, dt)
         if state is not self._moved and "steps" in self._dispatchers:  # its energies belong to another state
@@ -148,14 +149,14 @@ class Engine:
             self.load = no_load(state)
         move = self._move_molecules if isinstance(self.model, Model) else self._move_body
         self._observed_load = None
-        self._stale = not move(state, self.load, row, workspaces, (float(dt), int(until), observed))
+        self._stale = not move(state, self.load, integrator, workspaces, (float(dt), int(until), observed))
 
-    def _move_molecules(self, state: State, load: Load, row: Scheme, workspaces: tuple, step: StepArguments) -> bool:
+    def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
         dispatcher = self._dispatcher("steps", workspaces)
-        bound_to = (self.model, row, state, load, dispatcher)
+        bound_to = (self.model, integrator, state, load, dispatcher)
         if self._advance is None or any(now is not then for now, then in zip(bound_to, self._advance[0], strict=True)):
-            model, rest = self.model_for(row), self._flow_arguments(row, state)
+            model, rest = self.model_for(integrator), self._flow_arguments(integrator, state)
             kind = (type(model.rotor), type(rest[0]))
             if kind not in self._codes:
                 self._codes[kind] = molecule_code(model, rest[0])
@@ -168,32 +169,31 @@ class Engine:
             dispatcher.bind(self._handle_status(status, state), state, load, other)
         return advance.loaded
 
-    def _move_body(self, state: State, load: Load, row: Scheme, workspaces: tuple, step: StepArguments) -> bool:
+    def _move_body(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance a body. Returns whether the load belongs to the new position."""
-        if self._row is None or self._row[0] is not row:
-            self._row = row, self._flow_arguments(row, state)
-        model, rest, cursor = self.model_for(row), self._row[1], np.array([0, not self._stale, 0], np.int64)
+        if self._bound_flows is None or self._bound_flows[0] is not integrator:
+            self._bound_flows = integrator, self._flow_arguments(integrator, state)
+        model, rest = self.model_for(integrator), self._bound_flows[1]
+        cursor = np.array([0, not self._stale, 0], np.int64)
         while status := advance_body(model, state, load, workspaces, *rest, *step, cursor):
             workspaces = self._handle_status(status, state)
         return cursor[1] != 0  # also False after no step, because then no forces were evaluated
 
-    def _flow_arguments(self, row: Scheme, state: State) -> tuple:
+    def _flow_arguments(self, integrator: Scheme, state: State) -> tuple:
         """The arguments of the compiled step loop that depend on the integrator."""
-        if row.has_gradient and self._probe is None:
+        if integrator.has_gradient and self._probe is None:
             self._probe = gradient_workspace(state)
-        if row.barostat is not None and self._box_workspace is None:
+        if integrator.barostat is not None and self._box_workspace is None:
             self._box_workspace = barostat_workspace(state)
-        probe, box = (
-            self._probe if row.has_gradient else None,
-            self._box_workspace if row.barostat is not None else None,
-        )
-        return row.thermostat or NoThermostat(), row.barostat or NoBarostat(), flow_arrays(row), probe, self._heat, box
+        probe = self._probe if integrator.has_gradient else None
+        box = self._box_workspace if integrator.barostat is not None else None
+        flows = integrator.thermostat or NoThermostat(), integrator.barostat or NoBarostat(), flow_arrays(integrator)
+        return *flows, probe, self._heat, box
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
-            self._dispatchers[use] = TermDispatcher(
-                workspaces, isinstance(self.model, Model), self._setup.with_energies
-            )
+            is_molecular = isinstance(self.model, Model)
+            self._dispatchers[use] = TermDispatcher(workspaces, is_molecular, self._setup.with_energies)
         return self._dispatchers[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
@@ -362,11 +362,11 @@ class Engine:
         return workspaces
 
 
-def _as_scheme(row: Scheme | Solver) -> Scheme:
-    """Return `row` as a `Scheme`. Raises TypeError for a solver."""
-    if not isinstance(row, Scheme):
-        raise TypeError(f"{row.name} is a general solver, which only OdeEngine uses")
-    return row
+def _as_scheme(integrator: Scheme | Solver) -> Scheme:
+    """The same integrator, if it is a scheme. Raises TypeError for a solver."""
+    if not isinstance(integrator, Scheme):
+        raise TypeError(f"{integrator.name} is a general solver, which only OdeEngine uses")
+    return integrator
 
 
 def keep_time(state: State, dt: float) -> None:

@@ -31,11 +31,11 @@ class ExternalEngine(Engine, ABC):
         self._heat_offset = 0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
         self._moved: State | None = None
 
-    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+    def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """None: the program itself keeps the variables of its thermostat and barostat."""
         return np.zeros(0)
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         keep_time(state, dt)
         self._send(state)
         self._moved = state

@@ -167,8 +167,8 @@ class OdeEngine(Engine):
         """Evaluations of the rates by DOP853 or Radau since its last start."""
         return self._solver.nfev if self._solver is not None else 0
 
-    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
-        solver = _as_solver(row)
+    def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
+        solver = _as_solver(integrator)
         omega = []
         if len(state.rotation):
             for k in range(3):
@@ -182,9 +182,9 @@ class OdeEngine(Engine):
             y = np.concatenate([[state.time[NOW], 0.0], y, y, self._scales(solver, state, y)])
         return y
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         """As `Engine.advance`; DOP853 and Radau choose their steps in between. Raises SimulationError, Halted."""
-        solver = _as_solver(row)
+        solver = _as_solver(integrator)
         self._prepare(state)
         keep_time(state, dt)
         self._moved = state
@@ -204,20 +204,20 @@ class OdeEngine(Engine):
         super().recall(state, memory)
         self._restart = False
 
-    def check(self, state: State, row: Scheme | Solver, dt: float, start: State | None) -> None:
+    def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
         """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
         forces have not changed since."""
-        solver, variables = _as_solver(row), len(state.extra_variables) // 3
+        solver, variables = _as_solver(integrator), len(state.extra_variables) // 3
         if solver.name != RK4:
             time, length = state.extra_variables[:2]
             scales = state.extra_variables[2 + 2 * variables :]
             if not (0 <= time <= state.time[NOW] and length >= 0 and (scales > 0).all()):
                 raise ValueError("the last step of its solver is invalid")
-            if start is not None and not np.array_equal(scales, self.variables(start, row)[2 + 2 * variables :]):
+            if start is not None and not np.array_equal(scales, self.variables(start, integrator)[2 + 2 * variables :]):
                 raise ValueError("the scales of its variables differ from the start")
         repeated = state.copy()
         try:
-            self.advance(repeated, row, dt, int(state.step[NOW]))
+            self.advance(repeated, integrator, dt, int(state.step[NOW]))
         except (SimulationError, ValueError) as error:
             raise ValueError(f"its solver does not reach its state: {error}") from None
         for name, found, given in zip(State._fields, repeated, state, strict=True):
@@ -321,11 +321,11 @@ class OdeEngine(Engine):
         return np.concatenate(parts)
 
 
-def _as_solver(row: Scheme | Solver) -> Solver:
-    """Return `row` as a `Solver`. Raises TypeError for a scheme."""
-    if isinstance(row, Scheme):
-        raise TypeError(f"{row.name} is an integrator of flows; OdeEngine needs a general solver")
-    return row
+def _as_solver(integrator: Scheme | Solver) -> Solver:
+    """The same integrator, if it is a solver. Raises TypeError for a scheme."""
+    if isinstance(integrator, Scheme):
+        raise TypeError(f"{integrator.name} is an integrator of flows; OdeEngine needs a general solver")
+    return integrator
 
 
 def _form(solver: Solver, state: State) -> AttitudeForm:

@@ -24,17 +24,17 @@ class Halted(Exception):
 
 
 class Engine(Protocol):
-    """The methods of an engine that a run uses. `row` is the integrator."""
+    """The methods of an engine that a run uses."""
 
-    def variables(self, state: State, row: Scheme | Solver) -> np.ndarray:
+    def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The extra variables of an integrator (`state.extra_variables`) at the begin of a segment."""
         ...
 
-    def begin(self, state: State, row: Scheme | Solver) -> State:
+    def begin(self, state: State, integrator: Scheme | Solver) -> State:
         """A copy of a state with the variables of an integrator."""
-        return state.copy()._replace(extra_variables=self.variables(state, row))
+        return state.copy()._replace(extra_variables=self.variables(state, integrator))
 
-    def advance(self, state: State, row: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
+    def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         """Move the state in place, in steps of dt, until its step counter is `until`. Raises SimulationError.
         `observed`: whether `evaluate_current` follows; affects speed only."""
         ...
