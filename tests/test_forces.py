@@ -442,9 +442,9 @@ def test_an_address_is_held_to_the_type_it_was_compiled_for():
     own = engine.workspaces["lennard_jones"]
     sites = own.sites._replace(first=own.sites.first.astype(np.int64))
     loading = TermDispatcher((own,), False, np.ones(1, np.int64))
-    with pytest.raises(TypingError, match="find was compiled for parcel"):
+    with pytest.raises(TypingError, match="update was compiled for task_arguments"):
         TermDispatcher((own._replace(sites=sites),), False, np.ones(1, np.int64))
-    with pytest.raises(TypingError, match="tallied was compiled for parcel"):
+    with pytest.raises(TypingError, match="tallied was compiled for task_arguments"):
         loading.bind((own._replace(sites=sites),), state, no_load(state))
 
 
