@@ -261,7 +261,7 @@ def test_looking_costs_no_force_and_changes_no_bit(monkeypatch):
 
     def counted(self, state, scheme, dt, until, observed=False):
         loads.append(until - state.step[NOW])
-        return advance(self, state, scheme, dt, until, looked)
+        return advance(self, state, scheme, dt, until, observed)
 
     monkeypatch.setattr(Engine, "advance", counted)
     ends, costs = [], []
