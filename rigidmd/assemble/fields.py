@@ -196,20 +196,16 @@ def describe_fields(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict
     if "electric_field" in terms:
         found["electric_field"] = f"{_vector(not_none(fields.electric_V_per_nm))} V/nm"
         if fields.electric_frequency_per_ps is not None:
-            found["electric_field"] += (
-                f" cos(2 pi f t + {fields.electric_phase_deg:g}°), f = {fields.electric_frequency_per_ps:g}/ps; its "
-                "work is in the energy ledger"
-            )
+            frequency = f"f = {fields.electric_frequency_per_ps:g}/ps; its work is in the energy ledger"
+            found["electric_field"] += f" cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
     if "gravity" in terms:
         found["gravity"] = f"{_vector(not_none(fields.gravity_m_s2))} m/s²"
     for k, walls in enumerate(fields.walls):
         lower, upper = walls.positions_A
-        kind = (
-            f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g} kJ/mol, "
-            + (f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff")
-            if walls.kind == "lj93"
-            else f"harmonic, {walls.stiffness_kJ_mol_A2:g} kJ/mol/Å²"
-        )
+        kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
+        if walls.kind == "lj93":
+            kind = f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g} kJ/mol, "
+            kind += f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff"
         term = terms[f"walls_{k}"]
         assert isinstance(term, HarmonicWalls | LennardJonesWalls)
         what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"

@@ -27,9 +27,8 @@ def describe_stage(stage: Stage) -> list[str]:
             error = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
         elif stage.bias_kT:
             error = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
-        text = (
-            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {error}"
-        )
+        choice = f"integrator and step chosen at its start for an error of {error}"
+        text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
         text += f", {_thermostat(stage)}"
     if stage.has_barostat:
@@ -54,9 +53,8 @@ def _thermostat(stage: Stage) -> str:
     if stage.thermostat_kind != "langevin":
         return f"{text}, {stage.thermostat_time:g} ps"
     translation, rotation = stage.frictions
-    return f"{text}, friction {translation:g}/ps" + (
-        f" ({rotation:g}/ps of rotation)" if rotation != translation else ""
-    )
+    of_rotation = f" ({rotation:g}/ps of rotation)" if rotation != translation else ""
+    return f"{text}, friction {translation:g}/ps{of_rotation}"
 
 
 def _barostat(stage: Stage) -> str:
