@@ -129,7 +129,8 @@ def body_trial_system(
             changed = run.model_copy(update=plain | {"integrator": solver, "formulation": formulation})
             fits[name] = build_body(scene.model_copy(update={"run": changed}), applied)
         except SceneError as error:
-            refused[name] = "; ".join(_reason(text, solver) for text in error.errors)
+            reasons = (re.split("[:;] use ", text.removeprefix("run: "))[0] for text in error.errors)  # without advice
+            refused[name] = "; ".join(reasons).replace(solver, "it")
     if not fits:
         build_body(scene, applied)  # raises the error
     system = fits["velocity_verlet"]
@@ -169,11 +170,6 @@ def body_trial_system(
         spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
         speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     return trial_system, speed
-
-
-def _reason(error: str, name: str) -> str:
-    """An error message about an integrator as a reason, without the advice."""
-    return re.split("[:;] use ", error.removeprefix("run: "))[0].replace(name, "it")
 
 
 def _coarse_motion(system: BodySystem, whole: float) -> Motion:
