@@ -465,12 +465,8 @@ def lambda_of(series):
 )  # fmt: skip
 def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, capsys):
     before = names(water)
-    (tmp_path / "own.py").write_text(
-        f"import rigidmd\n@rigidmd.analysis.register\ndef mine(frames):\n    {body}\n"
-    )
-    assert words in said(
-        capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps"
-    )
+    (tmp_path / "own.py").write_text(f"import rigidmd\n@rigidmd.analysis.register\ndef mine(frames):\n    {body}\n")
+    assert words in said(capsys, water, "--trust", tmp_path / "own.py", "--only", "mine", "--from", "0.02ps")
     assert names(water) == before
 
 
