@@ -188,8 +188,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F27", "LAMMPS: the period of a chain for the inverse of its angular frequency",
         "engines/lammps/files.py",
-        "_n(1e3 * stage.thermostat_time / (2 * pi))",
-        "_n(1e3 * stage.thermostat_time)",
+        "_num(1e3 * stage.thermostat_time / (2 * pi))",
+        "_num(1e3 * stage.thermostat_time)",
         ("test_engine_settings.py::test_lammps_has_the_period_of_chains",),
     ),
     Mutation(

@@ -236,8 +236,8 @@ RINGS = [
     Mutation(
         "B17", "LAMMPS: the damping time of Langevin is the friction",
         "engines/lammps/files.py",
-        "{_n(1e3 / stage.frictions[0])}",
-        "{_n(1e3 * stage.frictions[0])}",
+        "{_num(1e3 / stage.frictions[0])}",
+        "{_num(1e3 * stage.frictions[0])}",
         ("test_engine_settings.py::test_lammps_has_the_damping_time_of_langevin",),
     ),
     Mutation(

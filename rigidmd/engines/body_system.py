@@ -23,7 +23,7 @@ from rigidmd.scene import BodyScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.validation import not_none
 
-Part = TypeVar("Part", bound=NamedTuple)
+Component = TypeVar("Component", bound=NamedTuple)
 
 
 class Pose(NamedTuple):
@@ -124,9 +124,8 @@ class BodySystem:
 
     def terms_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms from a time to the next break."""
-        translation, rotor, frame, resistance = self.body
-        body = Body(_at(translation, time), _at(rotor, time), _at(frame, time), _at(resistance, time))
-        return body, {name: _at(term, time) for name, term in self.terms.items()}
+        terms = {name: _piece(term, time) for name, term in self.terms.items()}
+        return Body._make(_piece(part, time) for part in self.body), terms
 
     def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
         """A user's function of a pose as a function of time and state that returns force and torque, checked."""
@@ -220,7 +219,7 @@ class BodySystem:
         return self.scale * (origin + np.cross(pose.angular_velocity_body, self.points) @ pose.rotation.T)
 
 
-def _at(part: Part, time: float) -> Part:
+def _piece(part: Component, time: float) -> Component:
     """A component of a body, with its prescribed functions of time continued from `time`."""
     courses = {key: piece_at(value, time) for key, value in part._asdict().items() if isinstance(value, TimeFunction)}
     return part._replace(**courses)

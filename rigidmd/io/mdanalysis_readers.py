@@ -26,7 +26,7 @@ def dimensions(cell: np.ndarray) -> list[float] | None:
     return edges_and_angles(cell)
 
 
-class _Sites(ReaderBase):
+class _SiteReader(ReaderBase):
     """Base of readers of all sites in the order of the scene. Molecules are whole and the box begins at the origin."""
 
     units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
@@ -52,7 +52,7 @@ class _Sites(ReaderBase):
         """Set `_file` and `n_atoms`."""
         raise NotImplementedError
 
-    def _take(self, i: int) -> tuple:
+    def _read_sites(self, i: int) -> tuple:
         """Positions and velocities (s, 3), cell (3, 3), time (ps) and step of a frame."""
         raise NotImplementedError
 
@@ -63,7 +63,7 @@ class _Sites(ReaderBase):
     def _read_frame(self, i):
         if not 0 <= i < self.n_frames:
             raise OSError(f"frame {i} does not exist")
-        positions, velocities, cell, time, step = self._take(i)
+        positions, velocities, cell, time, step = self._read_sites(i)
         self._frame = self.ts.frame = i
         self.ts.positions = positions
         if velocities is not None:
@@ -77,70 +77,70 @@ class _Sites(ReaderBase):
         return self._read_frame(self._frame + 1)
 
 
-class SitesOfGSD(_Sites):
+class GsdSiteReader(_SiteReader):
     """A .gsd file. MDAnalysis' reader returns central particles too, and wrapped positions."""
 
     def _open(self, path: Path) -> None:
         self._file = GsdReader(path)
         self.n_atoms = len(self._file.read(0).sites)
 
-    def _take(self, i: int) -> tuple:
+    def _read_sites(self, i: int) -> tuple:
         found = self._file.read(i)
         if len(found.sites) != self.n_atoms:
             raise ValueError(f"frame {i + 1} has another number of sites")
         return found.position[found.sites], found.site_velocities(), found.cell, found.time, found.step
 
 
-class SitesOfTraj(_Sites):
+class TrajSiteReader(_SiteReader):
     """A .traj file of ASE that rigidmd wrote. MDAnalysis has single precision."""
 
     def _open(self, path: Path) -> None:
         self._file = TrajReader(path)
         self.n_atoms = self._file.sites
 
-    def _take(self, i: int) -> tuple:
+    def _read_sites(self, i: int) -> tuple:
         found = self._file.read(i)
         return *self._file.of_sites(found), found.cell, found.time, found.step
 
 
-class _Timed(ProtoReader):
+class _WithTimes(ProtoReader):
     """Mixin for a reader that returns the times of the run (ps), evenly spaced or not, instead of those in the file."""
 
     def __init__(self, *source, times: list[float], **options):
         self._times = times
         self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
         super().__init__(*source, **options | {"times": times})  # a reader passes its options to its copies
-        self._timed(self.ts)
+        self._set_time(self.ts)
 
     @property
     def totaltime(self) -> float:
         return self._times[-1] - self._times[0]
 
-    def _timed(self, frame):
+    def _set_time(self, frame):
         frame.time = self._times[frame.frame]
         frame.dt = self._dt
         return frame
 
     def _read_frame(self, i):
-        return self._timed(super()._read_frame(i))
+        return self._set_time(super()._read_frame(i))
 
     def _read_next_timestep(self, ts=None):
         # every reader implements it
-        return self._timed(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
+        return self._set_time(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
 def _with_times(reader: Any) -> Any:
     """A subclass of a reader with the times of the run. It is a name of this module, so that readers can be pickled."""
     name = f"Timed{reader.__name__}"
-    globals()[name] = type(reader)(name, (_Timed, reader), {"__module__": __name__})
+    globals()[name] = type(reader)(name, (_WithTimes, reader), {"__module__": __name__})
     return globals()[name]
 
 
 TimedFrames = _with_times(MemoryReader)
 #: Readers by extension, and MDAnalysis' name of a format, or the reader, if it is not the extension.
 TIMED = {
-    ".xtc": _with_times(XTCReader), ".trr": _with_times(TRRReader), ".gsd": _with_times(SitesOfGSD),
-    ".traj": _with_times(SitesOfTraj), ".dcd": _with_times(DCDReader), ".nc": _with_times(NCDFReader),
+    ".xtc": _with_times(XTCReader), ".trr": _with_times(TRRReader), ".gsd": _with_times(GsdSiteReader),
+    ".traj": _with_times(TrajSiteReader), ".dcd": _with_times(DCDReader), ".nc": _with_times(NCDFReader),
     ".xyz": _with_times(XYZReader), ".pdb": _with_times(PDBReader),
 }  # fmt: skip
-FORMATS = {".nc": "NCDF", ".gsd": SitesOfGSD, ".traj": SitesOfTraj}
+FORMATS = {".nc": "NCDF", ".gsd": GsdSiteReader, ".traj": TrajSiteReader}

@@ -51,7 +51,7 @@ def unsupported_features(view: ForceFieldView) -> list[str]:
         found.append(f"forces.electrostatics = {view.electrostatics!r}: GROMACS has pme and reaction_field")
     if view.frozen.any():
         found.append("frozen molecules: GROMACS would compute forces between them")
-    shapes = [_body(m) for m in system.species]
+    shapes = [_gromacs_points(m) for m in system.species]
     solid = [m.name for m, body in zip(system.species, shapes, strict=True) if len(body.mass) > 3]
     found += [f"{name}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane" for name in solid]
     if sum(len(body.mass) == 3 for body in shapes) > 1:
@@ -81,7 +81,7 @@ def _unsupported_in_stage(stage: Stage) -> list[str]:
     return found
 
 
-def _body(molecule: Molecule) -> MassPoints:
+def _gromacs_points(molecule: Molecule) -> MassPoints:
     """The mass points of a molecule. Three points are adjacent, and the first is the apex of an isosceles triangle, as
     SETTLE needs it."""
     body = mass_points(molecule)
@@ -94,7 +94,7 @@ def _body(molecule: Molecule) -> MassPoints:
 
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     """Write the files for a system that begins at a state, and return their names. Raises OutputError."""
-    bodies = [_body(m) for m in view.system.species]
+    bodies = [_gromacs_points(m) for m in view.system.species]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
     text = {
@@ -119,7 +119,7 @@ def _script(names: list[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _extra(molecule: Molecule, body: MassPoints) -> int:
+def _extra_points(molecule: Molecule, body: MassPoints) -> int:
     """Number of mass points of a molecule without a site. They come after its sites."""
     return int((body.site < 0).sum())
 
@@ -130,7 +130,7 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
     species = system.model.species
     at, velocity = system.site_positions(state), system.site_velocities(state)
     extra = Points(
-        np.repeat(np.arange(len(species)), [_extra(system.species[k], bodies[k]) for k in species]),
+        np.repeat(np.arange(len(species)), [_extra_points(system.species[k], bodies[k]) for k in species]),
         gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
         gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
@@ -139,7 +139,7 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
     rows, s, e = [], 0, 0
     for n, k in enumerate(species):
         m = system.species[k]
-        count, added = len(m.masses), _extra(m, bodies[k])
+        count, added = len(m.masses), _extra_points(m, bodies[k])
         names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
         positions = np.concatenate([at[s : s + count], more[e : e + added]])
         velocities = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
@@ -165,7 +165,7 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     for k, kind in enumerate(kinds):
         parameters = f"{kind.mass:.10g} 0 A {sigma[k, k]:.12g} {epsilon[k, k]:.12g}"
         lines.append(f"K{k + 1} {parameters} ; {in_comment(kind.name)}")
-    if any(_extra(m, body) for m, body in zip(system.species, bodies, strict=True)):
+    if any(_extra_points(m, body) for m, body in zip(system.species, bodies, strict=True)):
         lines += [f"{POINT} 0 0 A 0 0 ; a point with mass alone"]
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
     pairs = [(i, j) for i in range(len(kinds)) for j in range(i, len(kinds))]
@@ -187,10 +187,10 @@ def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndar
     count, charges = len(m.masses), m.charges if view.coulomb is not None else np.zeros(len(m.masses))
     extra = np.cumsum(body.site < 0) - 1
     where = np.where(body.site >= 0, body.site, count + extra)
-    mass = np.zeros(count + _extra(m, body))
+    mass = np.zeros(count + _extra_points(m, body))
     mass[where] = body.mass
-    types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra(m, body)]
-    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra(m, body)))]
+    types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra_points(m, body)]
+    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra_points(m, body)))]
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     residue = as_word(m.residue_names[0])
     lines += [

@@ -92,31 +92,31 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
         low, high = np.zeros(3), state.cell.diagonal()
         lines += _bounds(low, high)
         tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
-        lines += [f"{' '.join(map(_n, tilt))} xy xz yz"] if any(tilt) else []
+        lines += [f"{' '.join(map(_num, tilt))} xy xz yz"] if any(tilt) else []
     else:
         lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
     lines += ["", "Masses", ""]
-    lines += [f"{k + 1} {_n(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
+    lines += [f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
     lines += ["", "Atoms # full", ""]
     charge = view.charge
     rows = zip(system.sites.molecule + 1, view.kind + 1, charge, position, image, strict=True)
     lines += [
-        f"{i} {m} {k} {_n(q)} {_n(x)} {_n(y)} {_n(z)} {nx} {ny} {nz}"
+        f"{i} {m} {k} {_num(q)} {_num(x)} {_num(y)} {_num(z)} {nx} {ny} {nz}"
         for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
     ]
     per_fs = velocity * 1e-3  # Å/ps to Å/fs
     lines += ["", "Velocities", ""]
-    lines += [f"{i} {_n(x)} {_n(y)} {_n(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
+    lines += [f"{i} {_num(x)} {_num(y)} {_num(z)}" for i, (x, y, z) in enumerate(per_fs, 1)]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _n(number: Any) -> str:
+def _num(number: Any) -> str:
     """The shortest decimal form of a number that is read back exactly."""
     return repr(float(number))
 
 
 def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
-    return [f"{_n(a)} {_n(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
+    return [f"{_num(a)} {_num(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
 
 
 def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
@@ -140,7 +140,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     if view.has_ewald_sum:
         style = "pppm" if forces.electrostatics == "pme" else "ewald"
         lines += [f"kspace_style {style} {accuracy(view):.3g}"]
-        lines += [f"kspace_modify gewald {_n(forces.ewald_alpha_per_A)}"]
+        lines += [f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
     lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
     points = ~view.is_body & ~view.frozen
@@ -182,7 +182,7 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
         return None
     name = STYLES[view.truncation] if law.cutoff < inf else "lj/cut"
     pairs = [(i, j) for i, j in np.argwhere(view.epsilon > 0) if i <= j]
-    cutoff = _n(_cutoff(law.cutoff))
+    cutoff = _num(_cutoff(law.cutoff))
     if name == "table":
         formulas = {}
         for i, j in pairs:
@@ -192,8 +192,8 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
         return _tables("lj", formulas, cutoff)
     arguments = cutoff
     if name in ("lj/gromacs", "lj/mdf") and not isinstance(law.truncation, Unmodified):
-        arguments = f"{_n(law.truncation.start)} {cutoff}"
-    coefficients = {(i, j): f"{_n(view.epsilon[i, j] / KCAL)} {_n(view.sigma[i, j])}" for i, j in pairs}
+        arguments = f"{_num(law.truncation.start)} {cutoff}"
+    coefficients = {(i, j): f"{_num(view.epsilon[i, j] / KCAL)} {_num(view.sigma[i, j])}" for i, j in pairs}
     shifts = f"pair_modify pair {name} shift yes" if view.truncation == "shift" and law.cutoff < inf else ""
     return PairStyle(name, arguments, coefficients, modify=shifts)
 
@@ -205,13 +205,13 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
     charge = [kind.charge for kind in view.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
-    cutoff = _n(_cutoff(law.cutoff))
+    cutoff = _num(_cutoff(law.cutoff))
     if isinstance(law, ScreenedCoulomb):
         return PairStyle("coul/long", cutoff, dict.fromkeys(pairs, ""), modify="pair_modify pair coul/long table 0")
     if law.cutoff == inf:
         return PairStyle("coul/cut", cutoff, dict.fromkeys(pairs, ""))
     if isinstance(law, DampedShiftedForce):
-        return PairStyle("coul/dsf", f"{_n(law.alpha)} {cutoff}", dict.fromkeys(pairs, ""))
+        return PairStyle("coul/dsf", f"{_num(law.alpha)} {cutoff}", dict.fromkeys(pairs, ""))
     of_pairs = {(i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs}
     return _tables("coulomb", of_pairs, cutoff)
 
@@ -248,27 +248,27 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
     seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
     lines = []
     if view.is_body.any():
-        lines.append(f"fix {BODIES} {BODIES} {_of_bodies(view, stage, seed)}")
+        lines.append(f"fix {BODIES} {BODIES} {_fix_of_bodies(view, stage, seed)}")
     if (~view.is_body & ~view.frozen).any():
-        lines += _of_points(view, stage, seed, alone=not view.is_body.any())
+        lines += _fixes_of_points(view, stage, seed, alone=not view.is_body.any())
     return lines
 
 
-def _of_bodies(view: ForceFieldView, stage: Stage, seed: int) -> str:
+def _fix_of_bodies(view: ForceFieldView, stage: Stage, seed: int) -> str:
     if stage.is_minimisation or stage.ensemble == "nve":
         return "rigid/nve/small molecule"
     if stage.thermostat_kind == "langevin":
         return f"rigid/small molecule langevin {_langevin(stage, seed)}"
     if stage.ensemble == "nph":
-        return f"rigid/nph/small molecule {_box(view, stage)}"
+        return f"rigid/nph/small molecule {_barostat(view, stage)}"
     links = f"tparam {stage.nose_hoover_links} 1 5"
     if stage.ensemble == "npt":
-        box = _box(view, stage)
-        return f"rigid/npt/small molecule {_chain(stage)} {box} {links} pchain {stage.nose_hoover_links}"
-    return f"rigid/nvt/small molecule {_chain(stage)} {links}"
+        box = _barostat(view, stage)
+        return f"rigid/npt/small molecule {_nose_hoover(stage)} {box} {links} pchain {stage.nose_hoover_links}"
+    return f"rigid/nvt/small molecule {_nose_hoover(stage)} {links}"
 
 
-def _of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> list[str]:
+def _fixes_of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> list[str]:
     if stage.is_minimisation or stage.ensemble == "nve":
         return [f"fix {POINTS} {POINTS} nve"]
     if stage.thermostat_kind == "langevin":
@@ -276,31 +276,33 @@ def _of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> li
         return [f"fix {POINTS} {POINTS} nve", langevin]
     if stage.has_barostat:
         kind = "npt" if stage.has_thermostat else "nph"
-        thermostat = f"{_chain(stage)} " if stage.has_thermostat else ""
-        return [f"fix {POINTS} {POINTS} {kind} {thermostat}{_box(view, stage)}"]
-    return [f"fix {POINTS} {POINTS} nvt {_chain(stage)} tchain {stage.nose_hoover_links}"]
+        thermostat = f"{_nose_hoover(stage)} " if stage.has_thermostat else ""
+        return [f"fix {POINTS} {POINTS} {kind} {thermostat}{_barostat(view, stage)}"]
+    return [f"fix {POINTS} {POINTS} nvt {_nose_hoover(stage)} tchain {stage.nose_hoover_links}"]
 
 
-def _chain(stage: Stage) -> str:
+def _nose_hoover(stage: Stage) -> str:
     """Temperatures and damping time, fs. LAMMPS has the inverse of an angular frequency, a scene its period."""
     first, last = stage.temperatures
-    return f"temp {_n(first)} {_n(last)} {_n(1e3 * stage.thermostat_time / (2 * pi))}"
+    return f"temp {_num(first)} {_num(last)} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
 
 
 def _langevin(stage: Stage, seed: int) -> str:
     first, last = stage.temperatures
-    return f"{_n(first)} {_n(last)} {_n(1e3 / stage.frictions[0])} {seed}"
+    return f"{_num(first)} {_num(last)} {_num(1e3 / stage.frictions[0])} {seed}"
 
 
-def _box(view: ForceFieldView, stage: Stage) -> str:
+def _barostat(view: ForceFieldView, stage: Stage) -> str:
     """Pressures, atm, without the tail correction, which the forces lack, and damping time, fs."""
     tail, volume = view.system.tail, view.system.state.volume
     tail_pressure = 0.0 if tail is None else tail.pressure(volume)
     first, last = ([(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
     damping = 1e3 * stage.barostat_time
     if stage.pressure_coupling == "isotropic":
-        return f"iso {_n(np.mean(first))} {_n(np.mean(last))} {_n(damping)}"
-    axes = " ".join(f"{axis} {_n(a)} {_n(b)} {_n(damping)}" for axis, a, b in zip("xyz", first, last, strict=True))
+        return f"iso {_num(np.mean(first))} {_num(np.mean(last))} {_num(damping)}"
+    axes = " ".join(
+        f"{axis} {_num(a)} {_num(b)} {_num(damping)}" for axis, a, b in zip("xyz", first, last, strict=True)
+    )
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
 
 
@@ -310,7 +312,7 @@ def _thermo(view: ForceFieldView) -> list[str]:
     if constant is None:
         return [f"thermo_style custom {columns}"]
     note = "# pe includes pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
-    potential = f"variable potential equal pe+({_n(constant / KCAL)})"
+    potential = f"variable potential equal pe+({_num(constant / KCAL)})"
     return [note, potential, f"thermo_style custom {columns} v_potential"]
 
 
@@ -326,7 +328,7 @@ def input_script(view: ForceFieldView) -> str:
         every = max(1, round(output.log_interval_ps * 1e3 / stage.timestep_fs))
         frames = max(1, round(output.trajectory_interval_ps * 1e3 / stage.timestep_fs))
         stage_fixes = fixes(view, k)
-        lines += ["", f"# {in_comment(stage.label)}: {stage.duration:g} ps", f"timestep {_n(stage.timestep_fs)}"]
+        lines += ["", f"# {in_comment(stage.label)}: {stage.duration:g} ps", f"timestep {_num(stage.timestep_fs)}"]
         lines += [*stage_fixes, f"thermo {every}"]
         if output.trajectory:
             lines += [f"dump frames all custom {frames} trajectory_{k}.lammpstrj id mol type xu yu zu vx vy vz"]
