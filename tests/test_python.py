@@ -211,7 +211,7 @@ HOVER = {
     "results.universe()": "Universe",
     "results.state": "State",
     "rigidmd.view.plot(results)": "Picture",
-    "rigidmd.view.show(results)": "StructureWidget | Film",
+    "rigidmd.view.show(results)": "StructureWidget | AnimationPage",
     "results.atoms()": "Atoms",
     "results.atoms(slice(3))": "list[Atoms]",
     'rigidmd.scene_from_atoms(results.atoms(), ["spce"], seed=3)': "MolecularScene",
