@@ -150,9 +150,9 @@ def test_a_table_serves_where_it_is_accurate_enough():
 
 @kernel(from_python=True)
 def screened_pairs(law, r2, energy, force):
-    for i in range(0, len(r2), lanes.width_of(r2)):
+    for i in range(0, len(r2), lanes.lanes_of(r2)):
         at = lanes.load(r2, i)
-        inverse, one, two = lanes.root_and_cube(at)
+        inverse, one, two = lanes.inverse_root_and_cube(at)
         u, w = screened(law, inverse, (one, two), at)
         lanes.store(energy, i, u)
         lanes.store(force, i, w)

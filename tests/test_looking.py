@@ -112,7 +112,7 @@ def test_the_film_of_a_body_is_its_motion(top, tmp_path):
 
 
 def test_the_film_of_molecules_is_their_trajectory(water, tmp_path, monkeypatch):
-    monkeypatch.setattr(molecule_film, "library", lambda: "var Chemiscope;")
+    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "var Chemiscope;")
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     data, record = data_of(page), read_record(water)
@@ -308,7 +308,7 @@ def test_a_folder_that_is_no_run(command, fault, said, water, tmp_path, capsys):
 @pytest.mark.filterwarnings("ignore:Reader has no dt information")  # of MDAnalysis, for a file of one frame
 @pytest.mark.parametrize("fault", ["missing", "other atoms", "other shapes", "noise", "empty"])
 def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(molecule_film, "library", lambda: "")
+    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
     folder = tmp_path / "run"
     shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
     path = folder / "trajectory.xtc"
@@ -334,7 +334,7 @@ def test_a_trajectory_that_is_not_that_of_the_run(fault, water, top, tmp_path, c
 
 
 def test_a_run_that_was_killed_shows_what_there_is(water, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(molecule_film, "library", lambda: "")
+    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
     folder = tmp_path / "run"
     shutil.copytree(water, folder, ignore=shutil.ignore_patterns(".trajectory*"))
     (folder / "summary.json").unlink()
@@ -361,8 +361,8 @@ def test_a_body_that_was_killed_shows_its_last_checkpoint(top, tmp_path, capsys)
 
 
 def test_a_film_says_what_it_leaves_out(water, tmp_path, monkeypatch):
-    monkeypatch.setattr(molecule_film, "library", lambda: "")
-    monkeypatch.setattr(molecule_film, "MOST", 3 * 3 * 648)
+    monkeypatch.setattr(molecule_film, "chemiscope_script", lambda: "")
+    monkeypatch.setattr(molecule_film, "MOST_COORDINATES", 3 * 3 * 648)
     page = tmp_path / "water.html"
     assert cli.main(["view", str(water), "-o", str(page)]) == 0
     assert len(numbers(data_of(page)["time"], "<f8")) == 3

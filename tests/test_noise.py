@@ -42,7 +42,7 @@ def test_known_answers(counter, key, result):
     assert tuple(map(int, found)) == result
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def fill(key, freedom, uniform, normal, square):
     for step in range(len(square)):
         uniform[step, 0], uniform[step, 1] = uniforms(key, 0, 0, step)
@@ -62,7 +62,7 @@ def test_distributions(freedom):
         assert abs(np.corrcoef(pair.T)[0, 1]) < 4 / np.sqrt(n)
 
 
-@kernel(outer=True)
+@kernel(from_python=True)
 def fill_batches(found, key, step):
     words = np.empty((2, 4, BATCH), np.uint64)
     for batch in range(len(found)):
@@ -106,8 +106,13 @@ def test_no_freedom_has_no_energy():
 
 def test_streams_are_apart():
     keys = {
-        key_of(seed, purpose, stage) for seed in range(4) for purpose in (LATTICE, MOMENTA, THERMOSTAT) for stage in (0, 1)
+        key_of(seed, purpose, stage)
+        for seed in range(4)
+        for purpose in (LATTICE, MOMENTA, THERMOSTAT)
+        for stage in (0, 1)
     }
     assert len(keys) == 4 * 3 * 2
-    numbers = {uniforms(key_of(1, THERMOSTAT), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)}
+    numbers = {
+        uniforms(key_of(1, THERMOSTAT), draw, m, step) for draw in (0, 1) for m in (0, 1) for step in (0, 1, 2**40)
+    }
     assert len(numbers) == 2 * 2 * 3

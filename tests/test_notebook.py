@@ -106,7 +106,7 @@ def test_elsewhere_progress_is_asked_for(capsys):
 
 
 def test_a_live_plot_is_one_picture_that_changes(cell, monkeypatch):
-    monkeypatch.setattr(live_plot, "SHARE", 1.0)  # of the time may go into drawing
+    monkeypatch.setattr(live_plot, "TIME_FRACTION", 1.0)  # of the time may go into drawing
     plain = Simulation(top(**FEW)).run(progress=False)
     live = rigidmd.LivePlot("theta", "energy_error", pause=0.0)
     watched = Simulation(top(**FEW), observers=live).run(progress=False)

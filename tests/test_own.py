@@ -69,7 +69,7 @@ def points(**sections) -> rigidmd.MolecularScene:
 
 @kernel(from_python=True)
 def every_function(x, y, out):
-    for i in range(0, len(x), lanes.width_of(x)):
+    for i in range(0, len(x), lanes.lanes_of(x)):
         a, b = lanes.load(x, i), lanes.load(y, i)
         found = (exp(a), log(a), math.pow(a, b), sin(b), cos(b), -(a**3), a**-2, math.sqrt(a) + abs(b))
         for k in range(8):

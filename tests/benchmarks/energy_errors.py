@@ -38,18 +38,18 @@ TOP = Path(__file__).parents[2] / "systems" / "heavy_top_3.toml"
 
 def counted(made: Callable[[], Simulation]) -> tuple:
     """A simulation, its results, and the force evaluations of its pilots."""
-    forces, look = [0], choice.look
+    forces, measure_errors = [0], choice.measure_errors
 
     def counting(subject, trial, *more):
         forces[0] += trial.steps * subject.methods[trial.integrator].force_evaluations
-        return look(subject, trial, *more)
+        return measure_errors(subject, trial, *more)
 
-    choice.look = walk.look = counting
+    choice.measure_errors = walk.measure_errors = counting
     try:
         simulation = made()
         return simulation, simulation.run(), forces[0]
     finally:
-        choice.look = walk.look = look
+        choice.measure_errors = walk.measure_errors = measure_errors
 
 
 def of_molecules(name: str, target: float, duration: float) -> list[str]:
