@@ -75,7 +75,7 @@ def _natural_order(example: Example) -> list:
 
 
 def find_example(name: str) -> Example:
-    """The example of this name, or the first scene of a numbered series of this name. Raises Faults."""
+    """The example of this name, or the first scene of a numbered series of this name. Raises InputError."""
     known = {example.name: example for example in [*examples(), *notebooks(), *scripts()]}
     if name in known:
         return known[name]
@@ -120,7 +120,7 @@ def contents() -> dict[str, str]:
 
 
 def chapter_text(name: str) -> str:
-    """A chapter as plain text, without comments; pictures become name and path. Raises Faults."""
+    """A chapter as plain text, without comments; pictures become name and path. Raises InputError."""
     if name not in CHAPTERS:
         near = difflib.get_close_matches(name, CHAPTERS, 1, 0.6)
         hint = f"did you mean {near[0]}? " if near else ""
