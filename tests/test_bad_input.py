@@ -297,9 +297,7 @@ def test_times_of_accuracy_are_finite(options, expected, capsys, tmp_path):
 def test_a_trusted_file_that_nothing_names_is_refused(capsys, tmp_path):
     (tmp_path / "own.py").write_text("")
     own = str(tmp_path / "own.py")
-    assert "own.py is not a file that [[forces.custom]]" in refused(
-        capsys, tmp_path, GOOD, "--trust", own
-    )
+    assert "own.py is not a file that [[forces.custom]]" in refused(capsys, tmp_path, GOOD, "--trust", own)
     assert main(["sweep", str(tmp_path / "bad.toml"), "--set", "seed=1,2", "--trust", own]) == 2
     assert "names no Python file by module in [[forces.custom]]" in capsys.readouterr().err
 

@@ -421,7 +421,10 @@ def test_what_is_frozen_is_left_alone():
 
 def test_check_tells_of_fields_and_of_what_is_left_out():
     text = describe(slit(OSCILLATING | {"gravity_m_s2": [0.0, 0.0, -9.81]}))
-    assert "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps; its work is in the energy ledger" in text
+    assert (
+        "electric field: (0.3, -0.2, 0.6) V/nm cos(2 pi f t + 40°), f = 2.5/ps; its work is in the energy ledger"
+        in text
+    )
     assert "gravity: (0, 0, -9.81) m/s²" in text
     assert (
         "walls 0: at z = 0 Å and z = 16 Å, on 60 sites: Lennard-Jones 9-3, sigma 2.5 Å, epsilon 1.5 kJ/mol, no" in text

@@ -586,7 +586,9 @@ def changes_of(kept: Checkpoint) -> list[tuple[str, Checkpoint]]:
     for name, array in kept.arrays.items():
         for kind, other in altered(array).items():
             found.append((f"{name}: {kind}", Checkpoint(kept.values, kept.arrays | {name: other})))
-        found.append((f"{name}: left out", Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name})))
+        found.append(
+            (f"{name}: left out", Checkpoint(kept.values, {k: a for k, a in kept.arrays.items() if k != name}))
+        )
     for path in leaves(kept.values)[1:]:
         *way, last = path
         whole = functools.reduce(lambda part, key: part[key], way, kept.values)[last]

@@ -899,7 +899,9 @@ def test_every_bar_has_the_rate_of_what_it_has_seen(monkeypatch, capsys, kind):
     now, shown = [0.0], []
     monkeypatch.setattr(progress.clock, "monotonic", lambda: now[0])
     monkeypatch.setattr(progress, "in_notebook", lambda: kind == "notebook")
-    monkeypatch.setattr(progress.DisplayArea, "show", lambda self, bundle, metadata=None: shown.append(bundle["text/plain"]))
+    monkeypatch.setattr(
+        progress.DisplayArea, "show", lambda self, bundle, metadata=None: shown.append(bundle["text/plain"])
+    )
     monkeypatch.setattr(sys.stderr, "isatty", lambda: kind == "terminal", raising=False)
     with progress.progress_of(100.0, "ps", True) as bar:
         for before in (70.0, 0.0):

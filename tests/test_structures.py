@@ -590,9 +590,7 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
     """The state has the box as it was described anew; the scene still has its own words for it."""
     box = {"lengths_A": 24.0, "angles_deg": [90.0, 59.0, 90.0]}
     system = build(small_scene({"argon": 4}, None, box=box))
-    assert any(
-        "box: its lattice is given by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes
-    )
+    assert any("box: its lattice is given by the cell with edges 24.0000, 24.0000, 23.63" in n for n in system.notes)
     write_state(tmp_path / "final.npz", system.saved(system.state))
     data = {"box": box, "structure": {"file": "final.npz"}, "molecules": [{"model": "argon"}],
             "start": {"temperature_K": 90.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip

@@ -85,15 +85,9 @@ class Engine:
     """
 
     def __init__(
-        self,
-        model: Model | Body,
-        terms: dict[str, NamedTuple],
-        precision: Precision = "double",
-        skin: float = 1.9,
-        python_forces: dict[str, Callable] | None = None,
-        threads: int | None = None,
-        needs_virials: bool = False,
-    ):
+        self, model: Model | Body, terms: dict[str, NamedTuple], precision: Precision = "double", skin: float = 1.9,
+        python_forces: dict[str, Callable] | None = None, threads: int | None = None, needs_virials: bool = False
+    ):  # fmt: skip
         self.model = model
         self.terms = terms
         self.names = list(terms)

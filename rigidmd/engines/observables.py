@@ -99,13 +99,9 @@ class Observation(NamedTuple):
 
 
 def observe(
-    system: System,
-    engine: Engine,
-    state: State,
-    verlet_step: float = nan,
-    freedom: DegreesOfFreedom | None = None,
-    moved: bool = False,
-) -> Observation:
+    system: System, engine: Engine, state: State, verlet_step: float = nan, freedom: DegreesOfFreedom | None = None,
+    moved: bool = False
+) -> Observation:  # fmt: skip
     """All observables, from one evaluation of forces and energies.
 
     freedom : degrees of freedom of the temperatures; by default `system.freedom`

@@ -30,13 +30,9 @@ LIMITS = {".xtc": (-2e7, 2e7), ".gro": (-9999.9, 99999.9), ".pdb": (-999.99, 999
 
 
 def open_trajectory(
-    path: Path,
-    system: System | BodySystem,
-    interval: float,
-    velocities: bool,
-    wrapped: bool,
-    kept: Sequence[int] | None = None,
-) -> "TrajectoryFile | GsdFile | TrajFile":
+    path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
+    kept: Sequence[int] | None = None
+) -> "TrajectoryFile | GsdFile | TrajFile":  # fmt: skip
     """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
     if (kind := {".gsd": GsdFile, ".traj": TrajFile}.get(path.suffix)) is not None:
         if not isinstance(system, System):
@@ -74,14 +70,9 @@ class TrajectoryFile:
     """
 
     def __init__(
-        self,
-        path: Path,
-        system: System | BodySystem,
-        interval: float,
-        velocities: bool,
-        wrapped: bool,
-        kept: Sequence[int] | None = None,
-    ):
+        self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
+        kept: Sequence[int] | None = None
+    ):  # fmt: skip
         self._path, self._format, self._system = path, path.suffix, system
         self._velocities, self._wrapped = velocities, wrapped
         self._universe = universe(system, system.state, velocities)

@@ -258,13 +258,9 @@ def _lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _nonbonded(
-    mm: Any,
-    view: ForceFieldView,
-    particles: Layout,
-    cutoff: float,
-    charge: np.ndarray,
-    lennard_jones: tuple[np.ndarray, np.ndarray] | None,
-):
+    mm: Any, view: ForceFieldView, particles: Layout, cutoff: float, charge: np.ndarray,
+    lennard_jones: tuple[np.ndarray, np.ndarray] | None
+):  # fmt: skip
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
     force = mm.NonbondedForce()
     force.setUseDispersionCorrection(False)
