@@ -284,6 +284,6 @@ FRESH: list[Mutation] = [
         "run/molecular.py",
         "            self.state.energy_ledger[REMOVED] -= remove_momentum(",
         "            self.state.energy_ledger[REMOVED] += remove_momentum(",
-        ("test_baths.py::test_degrees_of_freedom_follow_the_thermostat",),
+        ("test_thermostats.py::test_degrees_of_freedom_follow_the_thermostat",),
     ),
 ]  # fmt: skip

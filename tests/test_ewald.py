@@ -435,7 +435,7 @@ def test_waves_are_those_of_the_cell_that_was_described(limit, angle):
     assert seen.components["coulomb_reciprocal"] == pytest.approx(
         EwaldOracle(x, q, owner, cell, 0.285, 10.0, inside).reciprocal, rel=1e-11
     )
-    described = any("box: its lattice is described by" in note and "c' = c - a" in note for note in system.notes)
+    described = any("box: its lattice is given by" in note and "c' = c - a" in note for note in system.notes)
     assert described == (angle == 59.0)
 
 

@@ -513,10 +513,6 @@ def test_fields_that_are_tied_to_places_say_so():
     def scene(fields):
         return small_scene({"spce": 4}, 36.0, fields=fields)
 
-    assert scene({"walls": [LJ]}).fields.depends_on_position
-    assert scene({"restraints": [HELD]}).fields.depends_on_position
-    assert scene({"gravity_m_s2": [0.0, 0.0, -1.0], "walls": [LJ]}).fields.depends_on_position
-    assert not scene(OSCILLATING).fields.depends_on_position
     assert build(scene(OSCILLATING)).position_dependent == []
     assert alone({"kite": 1, "etik": 1}, STEADY)[0].position_dependent == ["electric_field"]
     assert build(scene({"walls": [LJ], "restraints": [HELD]} | STEADY)).position_dependent == [

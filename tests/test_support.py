@@ -23,9 +23,9 @@ OPEN = "the assumptions about Numba and the rules of compiled code are what it t
 PAST = {
     "support.py": (["rigidmd"], "is the door"),
     "test_compile.py": (["rigidmd.compile", "rigidmd.forces.terms"], OPEN),
-    "test_lanes.py": (["rigidmd.compile"], OPEN),
+    "test_simd.py": (["rigidmd.compile"], OPEN),
     "test_threads.py": (["rigidmd.compile"], OPEN),
-    "test_watch.py": (["rigidmd.compile"], "a script of a user who compiles a function"),
+    "test_checks.py": (["rigidmd.compile"], "a script of a user who compiles a function"),
     "test_strangers.py": (["rigidmd.core.process"], "a script in so little memory that it loads nothing else"),
 }
 FILES = sorted(TESTS.rglob("*.py"))

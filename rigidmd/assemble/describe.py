@@ -24,7 +24,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
 
-#: Precision of forces, for reports. Times: docs/benchmarks.md; the error is the tolerance of tests/test_lanes.py.
+#: Precision of forces, for reports. Times: docs/benchmarks.md; the error is the tolerance of tests/test_simd.py.
 PRECISIONS = {
     "double": 'double precision (precision = "mixed" takes about half the time; its forces have errors of 1e-5)',
     "mixed": "mixed precision: single between sites, with errors of forces of 1e-5, else double",

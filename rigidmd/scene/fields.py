@@ -124,12 +124,6 @@ class Fields(Section):
         if self.electric_phase_deg and self.electric_frequency_per_ps is None:
             yield "electric_phase_deg would do nothing without electric_frequency_per_ps"
 
-    @property
-    def depends_on_position(self) -> bool:
-        """Whether walls, restraints or gravity make energies depend on absolute positions, which a barostat excludes.
-        Charges in an electric field do so too, see `System.position_dependent`."""
-        return bool(self.walls or self.restraints or any(self.gravity_m_s2 or ()))
-
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]

@@ -546,7 +546,7 @@ class Faulty(rigidmd.Force):
 @pytest.mark.parametrize(
     "way, word",
     [
-        ("raises", r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_own.py"),
+        ("raises", r"on_molecules of the force faulty raised KeyError: 'charge', line \d+ of .*test_user_code.py"),
         ("shape", r"the force faulty returned forces of the shape \(3,\), not \(100, 3\)"),
         ("energy", "returned 'much' as its energy"),
         ("tuple", "returned ndarray; it must return a tuple"),
