@@ -1,6 +1,7 @@
 """The vocabulary: docstrings, messages, help texts and documents use the field's terms."""
 
 import ast
+import functools
 import re
 import sys
 
@@ -35,10 +36,7 @@ REFUSED = {
     r"rooms?|doors?|houses?|whoever": "package, interface, architecture; memory, space",
     r"reliefs?|relieves?|relieved|relieving": "overlap removal",
 }
-WORDS = [
-    (re.compile(rf"(?<![\w`./-])(?:{pattern})(?![\w`/-])", re.IGNORECASE), better)
-    for pattern, better in REFUSED.items()
-]
+WORDS = re.compile(rf"(?<![\w`./-])(?:{'|'.join(f'({pattern})' for pattern in REFUSED)})(?![\w`/-])", re.IGNORECASE)
 
 #: Uses that stay: they are names of the field or of keys.
 ALLOWED = re.compile(
@@ -57,21 +55,24 @@ ALLOWED = re.compile(
 
 def refused_in(text):
     """(position, word, better) of each refused word in plain text."""
-    kept = [match.span() for match in ALLOWED.finditer(text)]
-    for pattern, better in WORDS:
-        for match in pattern.finditer(text):
-            if not any(start <= match.start() and match.end() <= end for start, end in kept):
-                yield match.start(), match.group(), better
+    for match in WORDS.finditer(text):
+        around = text[max(0, match.start() - 40) : match.end() + 40]
+        at = match.start() - max(0, match.start() - 40)
+        if not any(m.start() <= at < m.end() for m in ALLOWED.finditer(around)):
+            yield match.start(), match.group(), list(REFUSED.values())[match.lastindex - 1]
+
+
+CODE = re.compile(r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+|\]\([^)\s]*\)", re.DOTALL)
 
 
 def without_code(text):
     """Text in which quoted code and the targets of links are blank, so that positions and lines stay."""
-    return re.sub(
-        r"```.*?```|`[^`\n]*`|<[^>\n]*>|https?://\S+|\]\([^)\s]*\)",
-        lambda m: re.sub(r"[^\n]", " ", m.group()),
-        text,
-        flags=re.DOTALL,
-    )
+    return CODE.sub(lambda m: re.sub(r"[^\n]", " ", m.group()), text)
+
+
+@functools.cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def texts_of(path):
@@ -80,7 +81,7 @@ def texts_of(path):
     if path.suffix == ".md":
         yield 1, without_code(source)
         return
-    tree = ast.parse(source)
+    tree = tree_of(path)
     inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
@@ -135,7 +136,7 @@ ALLOWED_NAMES: set[str] = set()
 
 def names_in(path):
     """(line, name) of what a Python file defines: functions, classes, arguments, variables, attributes."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             yield node.lineno, node.name
         elif isinstance(node, ast.arg):
