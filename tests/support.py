@@ -249,7 +249,7 @@ HOMES = {
     "commands.arguments": "read_scene",
     "core.files": "AppendedFile",
     "core.integrators": "DRIFT FORMULATIONS Flow KICK REMOVE_MOMENTUM SCHEMES Solver WITH_THERMOSTAT composed split",
-    "core.state": "HEAT Load ORIGIN REMOVED WORK no_load state_of",
+    "core.state": "HEAT Load ORIGIN STORED_NAMES REMOVED WORK no_load state_of",
     "core.state_file": "SavedState read_state write_state",
     "core.toml": "line_of",
     "dynamics.thermostats": "Andersen Langevin NoseHoover Ramp VelocityRescaling constant_ramp",

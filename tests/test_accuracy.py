@@ -649,7 +649,7 @@ def test_averages_need_a_thermostat_at_one_temperature(capsys):
         measure_averages(Scene.read(TOP))
     with pytest.raises(SceneError, match="one temperature and one pressure"):
         measure_averages(springs(temperature_K=[300.0, 200.0]))
-    with pytest.raises(SceneError, match=r"no thermostat langevn; did you mean|no thermostat langevn"):
+    with pytest.raises(SceneError, match="unknown thermostat langevn; did you mean langevin"):
         measure_averages(springs(), ["baoab+langevn"])
     with pytest.raises(SceneError, match="unknown integrator verlet"):
         measure_averages(springs(), ["verlet"])

@@ -136,7 +136,7 @@ def test_results_in_memory_and_from_the_folder_agree(water):
         here = getattr(rigidmd.analysis, name)(results, start=0.02, **options)[column]
         there = registry.selected([name])[0].function(history, **options)[column]
         assert here == pytest.approx(there, rel=2e-3, abs=2e-3 * np.abs(there).max()), name
-    seen = results._histories[0.02]
+    seen = results._analysis_frames[0.02]
     assert np.array_equal(seen.tensor, history.tensor)
     assert len(seen.tensor) == 51 and seen.interval == pytest.approx(0.004)
     assert np.abs(seen.Q - history.Q).max() < 1e-5
@@ -311,7 +311,7 @@ def test_names_of_sites_are_suggested(water):
             rdf(history, "OW", largest=largest, width=width)
     with pytest.raises(OutputError, match="unknown axis 'w'; name x, y or z"):
         registry.selected(["density_profile"])[0].function(history, "w")
-    with pytest.raises(OutputError, match="bins"):
+    with pytest.raises(OutputError, match="at least one bin"):
         registry.selected(["density_profile"])[0].function(history, "z", bins=0)
     for largest in (0.01, -1.0, np.nan):
         with pytest.raises(OutputError, match="no wave vector"):
@@ -477,7 +477,7 @@ def test_a_function_of_ones_own_that_is_wrong(body, words, water, tmp_path, caps
         ("raise ValueError('no')", "own.py raised ValueError: no"),
         ("def (", "own.py raised SyntaxError"),
         ("import sys; sys.exit(0)", "own.py raised SystemExit"),
-        ("import rigidmd\n@rigidmd.analysis.register\ndef rdf(frames): return frames.time", "own.py: rdf is an analysis that comes with"),
+        ("import rigidmd\n@rigidmd.analysis.register\ndef rdf(frames): return frames.time", "own.py: rdf is an analysis of rigidmd"),
         ("import rigidmd\nrigidmd.analysis.register(lambda frames: frames.time)", "an analysis has the name of its function"),
     ],
 )  # fmt: skip

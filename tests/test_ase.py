@@ -359,7 +359,7 @@ def test_both_forms_have_the_force_and_torque_of_each_molecule(model):
     for form in ("gradient", "sites"):
         atoms.calc = RigidMD(model, atom_forces=form)
         forces = atoms.get_forces() * EV
-        placed = atoms.calc._placed(atoms)
+        placed = atoms.calc._fit_atoms(atoms)
         load, _ = placed.assembly.engine.evaluate(placed.state)
         torque = np.einsum("nij,nj->ni", placed.state.rotation, load.torque_body)
         arm = atoms.positions.reshape(4, 3, 3) - placed.state.position[:, None]
@@ -385,12 +385,12 @@ def test_a_force_on_a_massless_site_is_spread_with_its_torque(model):
 
 def strained(atoms: Atoms, strain: np.ndarray) -> float:
     """The energy after a strain (3, 3) that moves centres of mass and turns nothing."""
-    placed = atoms.calc._placed(atoms)
+    placed = atoms.calc._fit_atoms(atoms)
     system, other = placed.assembly.system, atoms.copy()
     owner = system.sites.molecule[system.sites.mass > 0]
-    centre = placed.state.position @ placed.turn
+    centre = placed.state.position @ placed.rotation
     other.set_cell(atoms.cell.array @ (np.eye(3) + strain))
-    other.positions[placed.assembly.order] = placed.atoms @ placed.turn + (centre @ strain)[owner]
+    other.positions[placed.assembly.order] = placed.atoms @ placed.rotation + (centre @ strain)[owner]
     other.calc = atoms.calc
     return other.get_potential_energy()
 
@@ -535,7 +535,7 @@ def test_ase_moves_what_it_holds_rigid():
     dynamics.attach(lambda: energies.append(atoms.get_total_energy()))
     dynamics.run(20)
     assert np.ptp(energies) < 1e-3 * atoms.get_kinetic_energy()
-    assert atoms.calc._placed(atoms).bent < 1e-10
+    assert atoms.calc._fit_atoms(atoms).bent < 1e-10
 
 
 @pytest.fixture(scope="module")

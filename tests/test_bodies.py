@@ -389,10 +389,20 @@ def test_satellite_mass_loss():
 def test_what_a_scene_lacks_is_not_there():
     parts = {path.stem: run(path.stem).system for path in BODIES}
     top = parts["heavy_top_1"]
-    assert [type(part).__name__ for part in top.body] == ["NoTranslation", "SplitRotor", "Inertial", "NoResistance"]
+    assert [type(part).__name__ for part in top.body] == [
+        "NoTranslation",
+        "SplitRotor",
+        "InertialFrame",
+        "NoResistance",
+    ]
     assert top.state.position.shape == (0, 3)
     stone = parts["dropped_stone"]
-    assert [type(part).__name__ for part in stone.body] == ["FreeTranslation", "NoRotor", "Turning", "NoResistance"]
+    assert [type(part).__name__ for part in stone.body] == [
+        "FreeTranslation",
+        "NoRotor",
+        "RotatingFrame",
+        "NoResistance",
+    ]
     assert stone.state.rotation.shape == (0, 3, 3)
     assert "q11" not in run("dropped_stone").samples.columns
     assert type(parts["satellite_wheel"].body.rotor).__name__ == "DrivenRotor"

@@ -306,4 +306,4 @@ def test_a_motion_that_is_not_stiff_gets_no_such_advice():
     run.run()
     assert run.engine.solver_steps > 50
     assert not run.engine.is_stiff
-    assert run.engine._stiff == 0
+    assert run.engine._stiff_steps == 0

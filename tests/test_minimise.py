@@ -281,10 +281,10 @@ def test_it_begins_from_overlaps():
     state.position[1] = state.position[0] + [0.03, 0.01, 0.0]
     state.position[12] = state.position[11] + [0.4, 0.2, 0.1]
     found = minimise(system, state, scene.stages[0])
-    assert found.before > 1e20 * WELL
+    assert found.energy_before > 1e20 * WELL
     assert found.converged
-    assert found.relief_steps > 0
-    assert found.after < 0
+    assert found.overlap_steps > 0
+    assert found.energy_after < 0
     assert found.force <= 0.1 * KJ_PER_MOL
     assert np.abs(np.linalg.det(state.rotation) - 1).max() < 1e-12
 
@@ -368,8 +368,8 @@ def test_it_can_be_stopped():
     system, _, state = shaken(build(scene), 1, spread=0.1)
     done = []
     found = minimise(system, state, scene.stages[0], lambda: len(done) == 2, done.append)
-    assert (found.converged, found.why, found.iterations) == (False, "interrupted", 2)
-    assert found.after < found.before
+    assert (found.converged, found.ended_by, found.iterations) == (False, "interrupted", 2)
+    assert found.energy_after < found.energy_before
 
 
 def test_charges_that_nothing_keeps_apart():

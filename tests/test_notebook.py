@@ -192,7 +192,7 @@ def test_plots_are_of_the_columns_with_their_units():
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("temperatur", "did you mean temperature"), ("stage_name", "has words"), ("qqq", "there are step, time")],
+    [("temperatur", "did you mean temperature"), ("stage_name", "has text"), ("qqq", "there are step, time")],
 )
 def test_a_column_that_cannot_be_plotted(name, expected):
     with pytest.raises(KeyError, match=expected):
@@ -296,7 +296,9 @@ def test_the_tutorial_runs(tmp_path):
     assert sum("image/png" in bundle for bundle in shown) == 4  # columns, errors of steps, the live plot, g(r)
     assert sum("<svg" in bundle.get("text/html", "") for bundle in shown) == 2
     assert sum("<progress" in bundle.get("text/html", "") for bundle in shown) == 3
-    hand, run = re.search(r"by hand ([\d.]+)°, in the run ([\d.]+)°", "".join(b["text/plain"] for b in shown)).groups()
+    hand, run = re.search(
+        r"by formula ([\d.]+)°, in the run ([\d.]+)°", "".join(b["text/plain"] for b in shown)
+    ).groups()
     assert float(hand) == pytest.approx(float(run), abs=2e-3)
 
 

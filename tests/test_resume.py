@@ -143,7 +143,7 @@ def stopped(tmp_path_factory):
         "[box]\ndensity_g_cm3 = 0.9\n[[molecules]]\nmodel = 'spce'\ncount = 40\n"
         "[forces]\ncutoff_A = 5.0\ntruncation = 'smooth_switch'\n[start]\ntemperature_K = 298.0\n"
         "[[stages]]\nensemble = 'nvt'\ntemperature_K = 298.0\nduration_ps = 0.1\ntimestep_fs = 1.0\n"
-        "[output]\nlog_interval_ps = 0.01\ntrajectory_interval_ps = 0.02\nfigure = false\n"
+        "[output]\nlog_interval_ps = 0.01\ntrajectory_interval_ps = 0.02\nfigures = false\n"
     )
     own = Scene.read(folder / "water.toml", {"threads": 1})
     Simulation(own, folder / "run", observers=stopped_at({60})).run()

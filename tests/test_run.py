@@ -538,7 +538,7 @@ def test_a_run_prints_each_note_once(tmp_path, capsys):
     """Those of the introduction and warnings are not repeated; the summary has all."""
     scene = {"watch.move": False, "stages.0.timestep_fs": 40.0, "stages.0.duration_ps": 0.4}
     text = "[box]\nlengths_A = 20\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[start]\ntemperature_K = 90\n"
-    text += "[[stages]]\nensemble = 'nve'\n[forces]\ncutoff_A = 3.0\n[output]\nfigure = false\n"
+    text += "[[stages]]\nensemble = 'nve'\n[forces]\ncutoff_A = 3.0\n[output]\nfigures = false\n"
     (tmp_path / "s.toml").write_text(text)
     options = [f"--set={key}={str(value).lower()}" for key, value in scene.items()]
     assert main(["run", str(tmp_path / "s.toml"), *options, "-o", str(tmp_path / "out")]) == 0

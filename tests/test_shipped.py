@@ -96,7 +96,7 @@ def test_the_name_of_a_series_is_its_first_scene(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["watr"], ["no scene 'watr'", "did you mean water", "`rigidmd examples`"]),
+        (["watr"], ["unknown scene 'watr'", "did you mean water", "`rigidmd examples`"]),
         (["heavytop_3"], ["did you mean heavy_top_3"]),
         (["steady_precession"], ["steady_precession_fast or steady_precession_slow"]),
         (["systems/water.toml"], ["did you mean water or"]),

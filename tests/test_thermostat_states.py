@@ -1,7 +1,7 @@
 """What thermostats evolve besides momenta: it outlives a stop."""
 
 import numpy as np
-from support import build, same_after_stops, small_scene, state_from
+from support import STORED_NAMES, build, same_after_stops, small_scene, state_from
 
 WATER = {
     "box": {"density_g_cm3": 0.9},
@@ -25,6 +25,6 @@ def test_a_checkpoint_gives_back_all_of_a_state():
     state = system.state._replace(extra_variables=rng.standard_normal(12))
     for array in (state.position, state.velocity, state.angular_momentum_body, state.energy_ledger):
         array[:] = rng.standard_normal(array.shape)
-    found = state_from({name: array.copy() for name, array in state._asdict().items()}, state)
+    found = state_from({name: array.copy() for name, array in zip(STORED_NAMES, state, strict=True)}, state)
     for name, a, b in zip(state._fields, found, state, strict=True):
         assert a.tobytes() == b.tobytes(), name

@@ -20,12 +20,9 @@ class Berendsen(NamedTuple):
 def couple(thermostat, model, state, h, draw):
     translation = translational_energy(model, state)
     rotation = kinetic_energy(model, state) - translation
-    scale = 1 + h * thermostat.rate * (
-        0.5 * thermostat.freedom_translation * thermostat.thermal_energy / translation - 1
-    )
-    scale_rotation = 1 + h * thermostat.rate * (
-        0.5 * thermostat.freedom_rotation * thermostat.thermal_energy / rotation - 1
-    )
+    half, weight = 0.5 * thermostat.thermal_energy, h * thermostat.rate
+    scale = 1 + weight * (half * thermostat.freedom_translation / translation - 1)
+    scale_rotation = 1 + weight * (half * thermostat.freedom_rotation / rotation - 1)
     scale_array(state.velocity, sqrt(scale))
     scale_array(state.angular_momentum_body, sqrt(scale_rotation))
     heat = (scale - 1) * translation + (scale_rotation - 1) * rotation
