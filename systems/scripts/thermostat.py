@@ -29,8 +29,7 @@ def couple(thermostat, model, state, h, draw):
     state.energy_ledger[0] += heat  # energy less heat is conserved
 
 
-# baoab couples in the middle of a step
-stage = {"ensemble": "nvt", "temperature_K": 330, "duration_ps": 2, "integrator": "baoab"}
+stage = {"ensemble": "nvt", "temperature_K": 330, "duration_ps": 2, "integrator": "baoab"}  # in the middle of a step
 water = {"box": {"density_g_cm3": 0.997}, "molecules": [{"model": "spce", "count": 216}], "stages": [stage]}
 scene = rigidmd.MolecularScene.from_dict(water)
 freedom = rigidmd.Simulation(scene).system.freedom
