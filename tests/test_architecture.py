@@ -51,15 +51,14 @@ def package_of(path):
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
-@functools.cache
-def imports(path):
-    """(line, module) of all imports of a file: at the top, inside functions, and for type checkers only."""
+def imports_in(source):
+    """(line, module) of all imports of a Python text: at the top, inside functions, and for type checkers only."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{name_of(path)}:{node.lineno}: a relative import"
+            assert node.level == 0, f"line {node.lineno}: a relative import"
             for alias in node.names:
                 inner = ROOT.joinpath(*node.module.split("."), alias.name)
                 is_module = inner.with_suffix(".py").is_file() or inner.is_dir()
@@ -67,22 +66,42 @@ def imports(path):
     return found
 
 
-def upward(path):
-    """'file:line: imports module, ...' for imports from packages above, and from the package rigidmd itself."""
-    package = package_of(path)
-    for line, module in imports(path):
+@functools.cache
+def imports(path):
+    return imports_in(path.read_text(encoding="utf-8"))
+
+
+def upward(package, found):
+    """'line: imports module, ...' for imports (line, module) from packages above, and from the package rigidmd itself."""
+    for line, module in found:
         root, _, rest = module.partition(".")
         other = rest.partition(".")[0]
         if root == "rigidmd" and RANK[other or "__init__"] > RANK[package]:
-            yield f"{name_of(path)}:{line}: imports {module}: {package} is below {other or 'rigidmd'}"
+            yield f"{line}: imports {module}: {package} is below {other or 'rigidmd'}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_imports_point_down(path):
     """Imports inside functions and for type checkers count. The order of layers excludes circles of packages."""
     assert package_of(path) in RANK, f"{name_of(path)} is in no layer"
-    found = list(upward(path))
+    found = [f"{name_of(path)}:{message}" for message in upward(package_of(path), imports(path))]
     assert not found, "\n".join(found)
+
+
+def test_every_kind_of_upward_import_is_found():
+    source = """
+from typing import TYPE_CHECKING
+import numpy
+from rigidmd.core.state import State
+if TYPE_CHECKING:
+    from rigidmd.view.plots import plot
+def build():
+    from rigidmd import run
+    import rigidmd.assemble.build
+    from rigidmd import Scene
+"""
+    assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == ["6", "8", "9", "10"]
+    assert not list(upward("__init__", imports_in(source)))
 
 
 @pytest.mark.parametrize("library", LIBRARIES)

@@ -145,11 +145,16 @@ def names_in(path):
             yield node.lineno, node.id if isinstance(node, ast.Name) else node.attr
 
 
-def refused_names(path):
+def refused_names_in(path):
+    """(line and name, refused parts) of the names that a file defines."""
     for line, name in names_in(path):
         parts = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_")
-        if name not in ALLOWED_NAMES and (bad := REFUSED_NAMES & set(parts)):
-            yield f"{path.relative_to(ROOT)}:{line}: the name {name!r} has {', '.join(sorted(bad))}"
+        if name not in ALLOWED_NAMES and (bad := sorted(REFUSED_NAMES & set(parts))):
+            yield f"{line}: the name {name!r}", bad
+
+
+def refused_names(path):
+    return [f"{path.relative_to(ROOT)}:{name} has {', '.join(bad)}" for name, bad in refused_names_in(path)]
 
 
 def comments_of(path):
@@ -175,6 +180,30 @@ def test_words_of_the_field(path):
     if path.suffix == ".py":
         found += refused_names(path)
     assert not found, "\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("As told by the bath", ["told", "bath"]),
+        ("A place in the box: see `place`", ["place"]),
+        ("Turning on one's own", ["Turning", "one's own"]),
+        ("is no number, so many, and goes on beside it", ["is no number", "so many", "goes on", "beside"]),
+        ("This takes place in its own file; there is no such file", []),
+        ("The law of cosines; a plane wave is turned off", []),
+        ("[a page](looking.md) of the wave vector `waves`", []),
+    ],
+)
+def test_which_words_are_refused(text, words):
+    assert [word for _, word, _ in refused_in(without_code(text))] == words
+
+
+def test_which_names_are_refused(tmp_path):
+    (path := tmp_path / "a.py").write_text(
+        "class ToldForce:\n    def leaning(self, room_size, rotation): self.wave = 1\n"
+    )
+    assert [name for _, name in names_in(path)] == ["ToldForce", "leaning", "self", "room_size", "rotation", "wave"]
+    assert [bad for _, bad in refused_names_in(path)] == [["told"], ["leaning"], ["room"], ["wave"]]
 
 
 if __name__ == "__main__":
