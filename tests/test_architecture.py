@@ -92,14 +92,14 @@ def test_every_kind_of_upward_import_is_found():
     source = """
 from typing import TYPE_CHECKING
 import numpy
-from rigidmd.core.state import State
+from PACKAGE.core.state import State
 if TYPE_CHECKING:
-    from rigidmd.view.plots import plot
+    from PACKAGE.view.plots import plot
 def build():
-    from rigidmd import run
-    import rigidmd.assemble.build
-    from rigidmd import Scene
-"""
+    from PACKAGE import run
+    import PACKAGE.assemble.build
+    from PACKAGE import Scene
+""".replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
     assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == ["6", "8", "9", "10"]
     assert not list(upward("__init__", imports_in(source)))
 
