@@ -21,7 +21,7 @@ from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, re
 from rigidmd.assemble.scenes import SOURCE, atoms_errors, scene_from_atoms
 from rigidmd.assemble.species import species_of
 from rigidmd.core.state import State, state_of
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
 from rigidmd.io.cells import basis_of, least_skewed_cell, standard_rotation
@@ -239,7 +239,7 @@ class _Assembly(NamedTuple):
     """A system of atoms, for any positions and for similar cells."""
 
     system: System
-    engine: Engine
+    engine: CpuEngine
     species: list[Molecule]
     matched: MatchedMolecules
     numbers: np.ndarray

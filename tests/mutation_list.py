@@ -49,14 +49,14 @@ CORE = [
     ),
     Mutation(
         "A5", "textbook solvers: the sign of the Coriolis term of the velocity",
-        "engines/ode.py",
+        "engines/ode/rates.py",
         "- W[i] * V[j] + W[j] * V[i]",
         "+ W[i] * V[j] - W[j] * V[i]",
         ("test_body_engine.py::test_a_frame_that_changes_its_axis_is_left_to_compositions",),
     ),
     Mutation(
         "A6", "textbook solvers: the growth of the moments of inertia is left out",
-        "engines/ode.py",
+        "engines/ode/rates.py",
         "L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]",
         "L[i] * y[n + j] - L[j] * y[n + i] - motor",
         ("test_textbook.py::test_a_satellite_that_loses_mass_keeps_its_angular_momentum",),

@@ -25,7 +25,7 @@ from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NO_CELL, NOW, State
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.engines.system import System
 from rigidmd.mechanics.free_rotor import rotate
 from rigidmd.mechanics.rotation import random_rotations
@@ -257,8 +257,8 @@ HOMES = {
     "dynamics.barostats": "COMPONENTS COUPLINGS CellRescaling Pressure VolumeMoves barostat_workspace",
     "dynamics.noise": "BATCH THERMOSTAT BAROSTAT Key LATTICE MOMENTA chi_square fill_normals key_of normals philox uniforms",
     "dynamics.observables": "largest_values sums_of_state",
-    "engines.cpu": "BehindWallError DTYPES NotFiniteError",
-    "engines.ode": "OdeEngine",
+    "engines.cpu.engine": "BehindWallError DTYPES",
+    "engines.ode.engine": "OdeEngine",
     "forces.body.applied": "SteadyForce",
     "forces.potentials.coulomb": "radial reaction_field",
     "forces.potentials.truncation": "SWITCH_FUNCTIONS SwitchCorrection SwitchTerm TRUNCATIONS Unmodified truncation_terms",

@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.dynamics.body_step_loop import Body
-from rigidmd.engines.cpu import Engine
-from rigidmd.engines.ode import OdeEngine
+from rigidmd.engines.cpu.engine import CpuEngine
+from rigidmd.engines.ode.engine import OdeEngine
 from rigidmd.engines.system import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import InertialFrame
@@ -108,9 +108,9 @@ class BodySystem:
             relative_tolerance=not_none(run.relative_tolerance), absolute_tolerance=not_none(run.absolute_tolerance)
         )
 
-    def engine(self) -> Engine:
+    def engine(self) -> CpuEngine:
         """A new engine for this body at time 0, which calls the functions in `applied`."""
-        kind = OdeEngine if self.scene.run.integrator in SOLVERS else Engine
+        kind = OdeEngine if self.scene.run.integrator in SOLVERS else CpuEngine
         return kind(
             *self.terms_at(0.0), python_forces={name: self._load_function(f) for name, f in self.applied.items()}
         )

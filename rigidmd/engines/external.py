@@ -1,16 +1,13 @@
 """External engines: LAMMPS and OpenMM behind the protocol of engines, chosen by `engine.name` of a scene."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.dynamics.model import Model
-from rigidmd.engines.cpu import keep_time
 from rigidmd.engines.force_field import force_field_of
-from rigidmd.engines.protocol import Engine
+from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 
@@ -19,13 +16,8 @@ class ExternalEngine(Engine, ABC):
     """Base of the engines that run another program. A stage of the scene determines the motion. The first tally of
     `evaluate` has the virial of all terms."""
 
-    version: str  # name and version of the program
-    moves: tuple[int, int] = (0, 0)  # moves of the box, tried and accepted; (0, 0) if the program does not report them
-    length_tolerance = 0.0  # relative error of distances within molecules
-
     def __init__(self, system: System, stage: int):
         self._system, self._view, self._stage = system, force_field_of(system), system.scene.stages[stage]
-        #: Whether the stage conserves energy. Otherwise heat is defined as the change of the energy.
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._known_state: State | None = None  # the present state of the program
         self._heat_offset = 0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
@@ -55,14 +47,6 @@ class ExternalEngine(Engine, ABC):
 
     def forget(self) -> None:
         self._known_state = None
-
-    @abstractmethod
-    def rotor(self, model: Model) -> "NamedTuple | None":
-        """The rotor that rotates bodies exactly as the program does; None if its method is different."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End the program."""
 
     @abstractmethod
     def _send(self, state: State) -> None:

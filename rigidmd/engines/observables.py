@@ -8,7 +8,6 @@ import numpy as np
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.momenta import DegreesOfFreedom
 from rigidmd.dynamics.observables import sums_of_state
-from rigidmd.engines import cpu
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.units import BAR, BOLTZMANN, KJ_PER_MOL
@@ -121,7 +120,7 @@ def observe(
         components["tail" if system.user_terms else "lennard_jones_tail"] = system.tail.energy(volume)
         tail_pressure = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
-    sums = engine.sums(state, load) if isinstance(engine, cpu.Engine) else sums_of_state(system.model, state, load)
+    sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
     translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
     correction = verlet_step**2 / 12
     translation_unbiased = translation + correction * sums.force

@@ -5,12 +5,15 @@ OpenMM) compute.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import Load, State
+from rigidmd.core.state import NOW, ORIGIN, Load, State
+from rigidmd.dynamics.observables import LargestValues, StateSums
+from rigidmd.errors import SimulationError
 
 
 class Tally(NamedTuple):
@@ -20,12 +23,26 @@ class Tally(NamedTuple):
     virial: np.ndarray  # (3, 3) molecular, sum F (x) R, u Å²/ps²
 
 
-class Halted(Exception):
-    """A run was asked to stop between two observations. The state is as at the last observation."""
-
-
 class Engine(Protocol):
-    """The methods of an engine that a run uses."""
+    """All that a run asks of an engine. An implementation needs the abstract methods. The defaults of all others mean
+    that the engine does not know or cannot do it, which a run accepts."""
+
+    version: str = "rigidmd"
+    """Name and version of the program"""
+    conserves_energy: bool = True
+    """Whether the energy less the ledger's heat and work is conserved, so that its drift is an error. Otherwise heat is
+    defined as the change of the energy"""
+    is_repeatable: bool = False
+    """Whether steps from an earlier state are repeated to the same bits, and evaluations at other states leave no trace
+    in the motion and are cheap"""
+    length_tolerance: float = 0.0
+    """Relative error of distances within molecules"""
+    load: Load | None = None
+    """The forces of the last step, where the engine keeps them"""
+    is_stiff: bool | None = None
+    """Whether stability, not accuracy, has limited these steps for long"""
+    stop_requested: Callable[[], bool] = staticmethod(lambda: False)
+    """Set by a run. An engine that chooses its steps calls it at each of them, and raises Halted if it is true"""
 
     @abstractmethod
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
@@ -48,6 +65,25 @@ class Engine(Protocol):
         """`evaluate` at the state that was just moved, with what its last step has already computed."""
         return self.evaluate(state)
 
+    def sums(self, state: State, load: Load) -> StateSums | None:
+        """Sums over the state that was just moved and its load from `evaluate_current`, if its last step has added them
+        up."""
+        return None
+
+    def extent(self, state: State) -> LargestValues | None:
+        """Largest values in the state that was just moved and its load, if its last step has found them."""
+        return None
+
+    @property
+    def moves(self) -> tuple[int, int] | None:
+        """Moves of the box, tried and accepted so far."""
+        return None
+
+    @property
+    def chosen_steps(self) -> tuple[int, int] | None:
+        """Steps that a solver has chosen itself, and its evaluations of forces."""
+        return None
+
     @abstractmethod
     def snapshot(self) -> State:
         """An exact copy of the state that was last moved."""
@@ -60,6 +96,51 @@ class Engine(Protocol):
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         """Resume from a state with the arrays of `memory`, to the same bits. Raises ValueError if they do not fit."""
 
+    def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
+        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
+        forces have not changed since."""
+        return None
+
     @abstractmethod
     def forget(self) -> None:
         """Discard what depends on positions, because they were changed from outside since the last step."""
+
+    def change(self, model: Any, terms: dict[str, NamedTuple]) -> None:
+        """Continue with a model and terms of the same types, as at a kink of prescribed functions of time."""
+        raise TypeError(f"{self.version} cannot change its forces")
+
+    def rotor(self, model: Any) -> "NamedTuple | None":
+        """The rotor by which rigidmd rotates bodies exactly as this engine does, if there is one."""
+        return None
+
+    def close(self) -> None:
+        """End what the engine has started outside this process."""
+        return None
+
+
+class Halted(Exception):
+    """A run was asked to stop between two observations. The state is as at the last observation."""
+
+
+class NotFiniteError(SimulationError):
+    """A position or momentum is not finite, or a position is too large to define forces."""
+
+    def __init__(self, state: State):
+        moving = [array for array in state[:4] if len(array)]
+        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
+        size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
+        if np.isfinite(size).all():
+            self.molecule = int(rows[0].argmax())
+            distance = rows[0][self.molecule]
+            self.reason = f"it is {distance:.3g} Å from the origin, too far to find its image of the box"
+        else:
+            self.molecule = int(size.argmax())
+            self.reason = "its position or momentum is not finite"
+        super().__init__(f"molecule {self.molecule + 1} is lost: {self.reason}")
+
+
+def keep_time(state: State, dt: float) -> None:
+    """Begin a new segment of equal steps, in place, if the step has changed or time was set from outside."""
+    time, step = state.time.tolist(), state.step.tolist()
+    if time[NOW] != time[ORIGIN] + (step[NOW] - step[ORIGIN]) * dt:
+        state.begin_segment()

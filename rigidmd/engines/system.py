@@ -12,7 +12,7 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import DegreesOfFreedom, mobile
-from rigidmd.engines.cpu import Engine, Precision
+from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.forces.ewald.errors import Charges, charges_of
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.potentials.lennard_jones import Tail
@@ -148,14 +148,14 @@ class System:
         """Residue name of each molecule (n,) in topology files."""
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
 
-    def engine(self) -> Engine:
+    def engine(self) -> CpuEngine:
         return self.engine_of(self.terms, self.scene.precision)
 
-    def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> Engine:
+    def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> CpuEngine:
         """A new engine for this system with the given terms."""
         scene = self.scene
         needs_virials = any(stage.ensemble == "nph" for stage in scene.stages)
-        return Engine(
+        return CpuEngine(
             self.model, terms, precision, scene.forces.skin_A, self.python_forces, scene.threads, needs_virials
         )
 

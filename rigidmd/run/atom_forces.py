@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from rigidmd.core.state import Load, State
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -41,7 +41,7 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def ase_results(
-    system: System, engine: Engine, state: State, form: Form = "gradient", atoms: np.ndarray | None = None
+    system: System, engine: CpuEngine, state: State, form: Form = "gradient", atoms: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Energy (eV), forces (a, 3) on the sites with mass (eV/Å) and, in a box, stress (6,) (eV/Å³) as ASE has them.
 
@@ -70,7 +70,7 @@ def gradient_forces(system: System, state: State, load: Load, atoms: np.ndarray 
 
 
 def site_forces(
-    system: System, engine: Engine, state: State, load: Load, atoms: np.ndarray | None = None
+    system: System, engine: CpuEngine, state: State, load: Load, atoms: np.ndarray | None = None
 ) -> np.ndarray:
     """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with the totals of `load`.
 

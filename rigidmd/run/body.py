@@ -14,8 +14,7 @@ from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.engines.body_system import BodySystem, Pose
-from rigidmd.engines.cpu import Engine
-from rigidmd.engines.ode import OdeEngine
+from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
@@ -77,8 +76,7 @@ class BodySimulation(Simulation):
 
     def _reset(self) -> None:
         self.engine = self.system.engine()
-        if isinstance(self.engine, OdeEngine):
-            self.engine.stop_requested = self._must_end
+        self.engine.stop_requested = self._must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def _prepare(self) -> None:
@@ -119,9 +117,7 @@ class BodySimulation(Simulation):
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
-        if isinstance(self.engine, OdeEngine):
-            self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
-            self.engine.recall(self.state, kept.of("engine").arrays)
+        self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
 
     def _reenter_segment(self, k: int) -> Segment:
         return self._segments[k]
@@ -163,7 +159,7 @@ class BodySimulation(Simulation):
         steps = sum(segment.steps for segment in self._segments)
         found = summarise_body(self.system, samples, steps, times, self._interrupted)
         found["stable_timestep_s"] = self._resume_data.stable
-        if getattr(self.engine, "is_stiff", False):
+        if self.engine.is_stiff:
             self.note(
                 "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
                 "much longer ones"

@@ -16,7 +16,8 @@ from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, largest_values
 from rigidmd.engines.body_motion import energies, is_balanced
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.cpu import BehindWallError, NotFiniteError
+from rigidmd.engines.cpu.engine import BehindWallError
+from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError

@@ -18,8 +18,8 @@ from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import HEAT, NOW, ORIGIN, REMOVED, WORK, State, state_of
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.dynamics.observables import LargestValues, largest_values
-from rigidmd.engines.cpu import Engine
 from rigidmd.engines.observables import Observation, observe
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import COLUMNS, Sample, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError
@@ -91,7 +91,6 @@ class MolecularSimulation(Simulation):
 
     scene: MolecularScene
     system: System
-    engine: "Engine | ExternalEngine"
 
     def __init__(
         self, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, *, forces: Any = (),
@@ -217,7 +216,7 @@ class MolecularSimulation(Simulation):
             table = describe_comparison(lines, title)
             raise EngineError(f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}")
 
-    def _engine_of(self, k: int) -> "Engine | ExternalEngine":
+    def _engine_of(self, k: int) -> Engine:
         """The engine of stage k; minimisations are always by rigidmd."""
         if not self.scene.engine.is_external or self.scene.stages[k].is_minimisation:
             return self.system.engine()
@@ -272,7 +271,7 @@ class MolecularSimulation(Simulation):
         return [stage.duration for stage in self.scene.stages]
 
     def _enter_segment(self, k: int) -> Segment:
-        self._resume_data.moves[self._resume_data.stage] = self.engine.moves
+        self._resume_data.moves[self._resume_data.stage] = self.engine.moves or (0, 0)
         self._resume_data.stage = k
         if self.scene.stages[k].is_minimisation:
             return self._enter_minimisation(k)
@@ -317,7 +316,7 @@ class MolecularSimulation(Simulation):
         evaluations = stage.steps * stage.scheme.force_evaluations
         if not self.scene.watch.stable_step or not is_estimate_cheap(self.system, evaluations):
             return
-        found = stiffest_mode(self.system, self.state, self.engine if isinstance(self.engine, Engine) else None)
+        found = stiffest_mode(self.system, self.state, self.engine if self.engine.is_repeatable else None)
         if found is None:
             return
         stable = self._resume_data.stable[k] = stable_angle(stage.scheme) / found.rate
@@ -361,7 +360,7 @@ class MolecularSimulation(Simulation):
     @property
     def extent(self) -> LargestValues | None:
         """Largest values in the state and its load, if they are known from the last step."""
-        return self.engine.extent(self.state) if isinstance(self.engine, Engine) else None
+        return self.engine.extent(self.state)
 
     def _observe(self, moment: Moment) -> Observation:
         stage = self.scene.stages[moment.stage]
@@ -379,7 +378,7 @@ class MolecularSimulation(Simulation):
         a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
         # an external engine may not report the heat of its thermostat
-        known = not stage.is_minimisation and getattr(self.engine, "conserves_energy", True)
+        known = not stage.is_minimisation and self.engine.conserves_energy
         return Sample(
             step=moment.step, time=moment.time, potential=seen.potential / KJ_PER_MOL,
             kinetic=seen.kinetic / KJ_PER_MOL, energy=energy, temperature=seen.temperature,
@@ -422,7 +421,7 @@ class MolecularSimulation(Simulation):
 
     def _summary(self, samples: Samples, times: RunTimes) -> dict[str, Any]:
         data = self._resume_data
-        data.moves[data.stage] = self.engine.moves
+        data.moves[data.stage] = self.engine.moves or (0, 0)
         return summarise(
             self.system, samples, self.state, data.removal.steps if data.removal else 0, times, self._interrupted,
             data.choices, data.stable, data.moves, data.minima, self.notes,
@@ -441,7 +440,7 @@ class MolecularSimulation(Simulation):
         yield f"at step {good.step}, ", good.state
         steps, system, method = int(self.state.step[NOW]) - good.step, self.system, self.segment.method
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
-        if short and isinstance(self.engine, Engine) and not (self.segment.action or system.python_forces):
+        if short and self.engine.is_repeatable and not (self.segment.action or system.python_forces):
             state = good.state.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
                 state = self.engine.begin(state, method)

@@ -7,7 +7,6 @@ import numpy as np
 from rigidmd.core.files import atomic_file
 from rigidmd.core.state import NOW, State
 from rigidmd.core.state_file import write_state
-from rigidmd.engines.cpu import Engine
 from rigidmd.engines.samples import Samples
 from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import save_figure
@@ -174,11 +173,11 @@ class StepWatch(Observer):
         self._run, self._check = run, check
 
     def see(self, moment: Moment) -> None:
-        run, engine = self._run, self._run.engine
-        if not isinstance(engine, Engine) or engine.load is None:
+        run, load = self._run, self._run.engine.load
+        if load is None:
             return  # no force has been evaluated yet
         stage = run.scene.stages[moment.stage]
-        if problem := self._check.failed_check(run.state, engine.load, stage, run.extent):
+        if problem := self._check.failed_check(run.state, load, stage, run.extent):
             raise problem
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.core.state import State
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import mobile
-from rigidmd.engines.cpu import BehindWallError
+from rigidmd.engines.cpu.engine import BehindWallError
 from rigidmd.engines.protocol import Engine
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.run.checks import kicks

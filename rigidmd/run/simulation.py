@@ -20,8 +20,7 @@ from rigidmd.core.display import Displayed
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
-from rigidmd.engines.cpu import NotFiniteError
-from rigidmd.engines.protocol import Engine, Halted
+from rigidmd.engines.protocol import Engine, Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, RigidMDWarning, SimulationError
 from rigidmd.io.checkpoint import Checkpoint, latest
 from rigidmd.io.folder import (

@@ -14,7 +14,7 @@ from rigidmd.assemble.user_code.pair_potential import PairLaw, PairPotentialErro
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.state import State
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
-from rigidmd.engines.cpu import CompileError
+from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.lennard_jones import Tail

@@ -19,12 +19,11 @@ import numpy as np
 
 from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
-from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files
 from rigidmd.engines.lammps.dump import read_dump
 from rigidmd.engines.observables import kinetic_energies
-from rigidmd.engines.protocol import Tally
+from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError

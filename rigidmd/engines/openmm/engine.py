@@ -5,26 +5,21 @@ term by term, so that observations leave no trace in the motion. OpenMM has no v
 energies at scaled centres of mass.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rigidmd.core.state import HEAT, Load, State
-from rigidmd.dynamics.model import Model
-from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm.stages import TOLERANCES, extra_forces, integration_groups, integrator_of, step
 from rigidmd.engines.openmm.system import NM, Group, layout, library, openmm_system
-from rigidmd.engines.protocol import Tally
+from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, intramolecular_energy, self_energy
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
-
-if TYPE_CHECKING:
-    pass
 
 PLATFORMS = ("CPU", "Reference", "CUDA", "OpenCL", "HIP")
 ANGSTROM = 1 / NM  # Å per nm
@@ -115,7 +110,7 @@ class OpenmmEngine(ExternalEngine):
         self._moved = state
 
     def close(self) -> None:
-        for name in ("_mover", "_seer", "_integrator"):
+        for name in ("_moving_context", "_evaluating_context", "_integrator"):
             vars(self).pop(name, None)
 
     def _send(self, state: State) -> None:
@@ -151,10 +146,6 @@ class OpenmmEngine(ExternalEngine):
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
         state.energy_ledger[HEAT] = self._heat_offset + self._heat(state)
-
-    def rotor(self, model: Model) -> None:
-        """None: OpenMM rotates molecules by constrained distances."""
-        return None
 
     def _heat(self, state: State) -> float:
         """Heat from a thermostat, up to a constant: the gain of the energy, u Å²/ps². OpenMM computes the energy of a

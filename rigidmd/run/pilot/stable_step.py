@@ -10,7 +10,7 @@ from rigidmd.assemble.species import species_of
 from rigidmd.core.integrators import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.core.state import Load, State
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.cpu import Engine
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.mechanics.free_rotor import SplitRotor

@@ -16,7 +16,7 @@ from rigidmd.core.state import State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.observables import observe
-from rigidmd.engines.ode import SMALLEST_SINE
+from rigidmd.engines.ode.rates import SMALLEST_SINE
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.run.pilot.choice import choose

@@ -16,10 +16,8 @@ import numpy as np
 from rigidmd.core.integrators import RK4, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error, slope
-from rigidmd.engines.cpu import NotFiniteError
 from rigidmd.engines.observables import Observation
-from rigidmd.engines.ode import OdeEngine
-from rigidmd.engines.protocol import Engine
+from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.units import KJ_PER_MOL
@@ -388,9 +386,9 @@ def measure_errors(system: TrialSystem, trial: Trial, exact: State | None, obser
         trial.rotation_error, trial.position_error = state_difference(state, exact)
     if len(state.rotation):
         trial.orthogonality_error = orthogonality_error(state.rotation)
-    if isinstance(engine, OdeEngine) and trial.tolerance is not None:
-        trial.forces = engine.evaluations
-        trial.timestep = system.span / engine.solver_steps / system.time_size
+    if (chosen := engine.chosen_steps) is not None:
+        count, trial.forces = chosen
+        trial.timestep = system.span / count / system.time_size
 
 
 def _average(system: TrialSystem, trial: Trial, length: float) -> None:

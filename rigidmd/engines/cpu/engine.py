@@ -21,7 +21,6 @@ from rigidmd.core.state import (
     NEEDS_PYTHON_FORCES,
     NOT_FINITE,
     NOW,
-    ORIGIN,
     Load,
     State,
     no_load,
@@ -30,10 +29,10 @@ from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, Piston, ba
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
 from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.observables import LargestValues, StateSums, sums_of_state
+from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.dynamics.step_loop import Advance, advance_body, flow_arrays, molecule_code
 from rigidmd.dynamics.thermostats import NoThermostat, thermostat_workspace
-from rigidmd.engines.protocol import Tally
+from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import LennardJonesWalls, SiteBehindWall
 from rigidmd.forces.terms import (
@@ -50,7 +49,7 @@ from rigidmd.forces.terms import (
 )
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
-__all__ = ["BehindWallError", "CompileError", "Engine", "NotFiniteError", "Precision", "keep_time"]
+__all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
 Precision = Literal["double", "mixed"]
 #: Owners of arrays in `Engine.memory` besides the terms, and the arrays of each.
@@ -72,8 +71,8 @@ class ComputedByPython(Protocol):
         ...
 
 
-class Engine:
-    """An engine of compiled code, see `rigidmd.engines.protocol.Engine`.
+class CpuEngine(Engine):
+    """An engine of compiled code.
 
     model : the constant part of the system
     terms : name -> term, in the order in which forces are added
@@ -83,6 +82,8 @@ class Engine:
     threads : number of threads, at most `NUMBA_NUM_THREADS`; None for all of them; affects speed only
     needs_virials : whether every step needs virials and no energies, as for a piston; affects speed only
     """
+
+    is_repeatable = True
 
     def __init__(
         self, model: Model | Body, terms: dict[str, NamedTuple], precision: Precision = "double", skin: float = 1.9,
@@ -116,7 +117,6 @@ class Engine:
         return dict(zip(self.names, self._workspaces or (), strict=False))
 
     def change(self, model: Model | Body, terms: dict[str, NamedTuple]) -> None:
-        """Continue with a model and terms of the same types, as at a kink of prescribed functions of time."""
         self.model, self.terms = model, terms
         self._workspaces = None
         self.forget()
@@ -128,9 +128,6 @@ class Engine:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
         integrator = _as_scheme(integrator)
         return np.zeros(getattr(integrator.thermostat, "variables", 0) + isinstance(integrator.barostat, Piston))
-
-    def begin(self, state: State, integrator: Scheme | Solver) -> State:
-        return state.copy()._replace(extra_variables=self.variables(state, integrator))
 
     def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         integrator = _as_scheme(integrator)
@@ -219,13 +216,10 @@ class Engine:
         self._observed_load, tallies = self._copies(self.load, moving)
         return self._observed_load, tallies
 
-    def sums(self, state: State, load: Load) -> StateSums:
-        """Sums over a state of molecules and a load that `evaluate_current` or `evaluate` returned for it."""
-        found = self._advance[1].sums if self._advance is not None and load is self._observed_load else None
-        return found or sums_of_state(cast(Model, self.model), state, load)
+    def sums(self, state: State, load: Load) -> StateSums | None:
+        return self._advance[1].sums if self._advance is not None and load is self._observed_load else None
 
     def extent(self, state: State) -> LargestValues | None:
-        """The extent of the state that was just moved and of its load. None for any other state."""
         if self._advance is None or self._stale or state is not self._moved:
             return None
         return self._advance[1].extent
@@ -309,7 +303,6 @@ class Engine:
 
     @property
     def moves(self) -> tuple[int, int]:
-        """Moves of the box tried and accepted so far."""
         return (0, 0) if (box := self._box_workspace) is None else (int(box.counts[0]), int(box.counts[1]))
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
@@ -363,13 +356,6 @@ def _as_scheme(integrator: Scheme | Solver) -> Scheme:
     return integrator
 
 
-def keep_time(state: State, dt: float) -> None:
-    """Begin a new segment of equal steps, in place, if the step has changed or time was set from outside."""
-    time, step = state.time.tolist(), state.step.tolist()
-    if time[NOW] != time[ORIGIN] + (step[NOW] - step[ORIGIN]) * dt:
-        state.begin_segment()
-
-
 def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
     """Copy kept arrays into the arrays of a tuple. Raises ValueError if they do not fit."""
     for name, array in kept.items():
@@ -386,23 +372,6 @@ def _check_arrays(state: State) -> None:
         if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
             kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
             raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
-
-
-class NotFiniteError(SimulationError):
-    """A position or momentum is not finite, or a position is too large to define forces."""
-
-    def __init__(self, state: State):
-        moving = [array for array in state[:4] if len(array)]
-        rows = [np.abs(array).reshape(len(array), -1).max(axis=1, initial=0.0) for array in moving]
-        size = np.max(np.where(np.isnan(rows), np.inf, rows), axis=0)
-        if np.isfinite(size).all():
-            self.molecule = int(rows[0].argmax())
-            distance = rows[0][self.molecule]
-            self.reason = f"it is {distance:.3g} Å from the origin, too far to find its image of the box"
-        else:
-            self.molecule = int(size.argmax())
-            self.reason = "its position or momentum is not finite"
-        super().__init__(f"molecule {self.molecule + 1} is lost: {self.reason}")
 
 
 class BehindWallError(SimulationError):

@@ -6,145 +6,35 @@ DOP853 and Radau. They are an independent check of the integrators, and only the
 """
 
 from collections.abc import Callable
-from math import hypot, sin
 
 import numpy as np
 from scipy.integrate import DOP853 as Dop853
 from scipy.integrate import Radau
 
-from rigidmd.compile import kernel
 from rigidmd.core.integrators import DOP853, FORMULATIONS, RADAU, RK4, Scheme, Solver
-from rigidmd.core.state import NOW, OK, ORIGIN, WORK, State, no_load
-from rigidmd.dynamics.body_step_loop import Body, relative_motion
-from rigidmd.engines.cpu import Engine, keep_time
-from rigidmd.engines.protocol import Halted
+from rigidmd.core.state import NOW, ORIGIN, WORK, State, no_load
+from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.cpu.engine import CpuEngine
+from rigidmd.engines.ode.rates import SINGULAR, is_singular, moment_rates_of, read, rk4, write_rates
+from rigidmd.engines.protocol import Halted, keep_time
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.frame import frame_rate
-from rigidmd.forces.body.resistance import add_resistance
-from rigidmd.forces.terms import compute_body_load, total_power
-from rigidmd.mechanics.free_rotor import moment_rates
 from rigidmd.mechanics.odes import (
     AttitudeForm,
     EulerAngles,
     Matrix,
     NoAttitude,
     Quaternion,
-    attitude_rates,
     attitude_variables,
-    write_rotation,
 )
-from rigidmd.mechanics.translation import body_component, inertial_mass
 
 FORMS: dict[str, AttitudeForm] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
 #: A step of DOP853 is at the limit of stability if step times eigenvalue is above STABLE. STIFF such steps show a stiff
 #: problem, MILD other steps in a row restart the count. Relative changes below ROUNDED within a step are rounding.
 STABLE, STIFF, MILD, ROUNDED = 6.1, 200, 6, 1e-14
-SINGULAR = 5  # status code beyond those of core.state: Euler angles too near theta = 0 or pi
-#: Below this sine, half of the digits of phi and psi are lost, because theta has an error of 1e-16.
-SMALLEST_SINE = 1e-8
-#: Below this sine, a step may jump over the pole.
-NEAR_A_POLE = 0.1
 
 
-@kernel(from_python=True)
-def moment_rates_of(rotor, time, k):
-    """`moment_rates` for calls from Python."""
-    return moment_rates(rotor, time, k)
-
-
-@kernel(from_python=True)
-def read(form, model, state, time, y):
-    """Write the solver's variables into a state."""
-    n = form.variables
-    state.time[NOW] = time
-    write_rotation(form, y, state.rotation)
-    for m in range(len(state.angular_momentum_body)):
-        for k in range(3):
-            inertia, _, carried, _ = moment_rates(model.rotor, time, k)
-            state.angular_momentum_body[m, k] = inertia * y[n + k] + carried
-        n += 3
-    for m in range(len(state.position)):
-        for k in range(3):
-            state.position[m, k] = y[n + k]
-            state.velocity[m, k] = y[n + 3 + k]
-    state.energy_ledger[WORK] = y[-1]
-
-
-@kernel(from_python=True)
-def write_rates(form, model, terms, state, load, time, y, dy):
-    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the axes of the frame.
-
-    I w' = n + L x w + P x v - h' - I' w; X' = v - Omega x X; V' = F/m - Omega x V; attitude by w - Q^T Omega;
-    W' = the power of drives and resistance, relative to the frame, and of changes of I and h.
-    """
-    read(form, model, state, time, y)
-    status = compute_body_load(terms, state, load, None)
-    if status != OK:
-        return status
-    velocity, omega = relative_motion(model, state)
-    dy[-1] = total_power(terms, state, velocity, omega) + add_resistance(model.resistance, state, load, velocity, omega)
-    W = frame_rate(model.frame, time)
-    n = form.variables
-    for m in range(len(state.rotation)):
-        attitude_rates(form, y, omega[0], omega[1], omega[2], dy)
-        q = state.rotation[m]
-        L = state.angular_momentum_body[m]
-        for k in range(3):
-            i = (k + 1) % 3
-            j = (k + 2) % 3
-            inertia, growth, _, motor = moment_rates(model.rotor, time, k)
-            torque = load.torque_body[m, k] + L[i] * y[n + j] - L[j] * y[n + i] - motor - growth * y[n + k]
-            for b in range(len(state.position)):
-                pi = model.translation.mass * body_component(q, state.velocity[b], i)
-                pj = model.translation.mass * body_component(q, state.velocity[b], j)
-                torque += pi * pj * (1 / inertial_mass(model.translation, j) - 1 / inertial_mass(model.translation, i))
-            dy[n + k] = torque / inertia if inertia > 0 else 0.0
-            dy[-1] -= (motor + 0.5 * growth * y[n + k]) * y[n + k]
-        n += 3
-    for m in range(len(state.position)):
-        V = state.velocity[m]
-        for k in range(3):
-            i = (k + 1) % 3
-            j = (k + 2) % 3
-            dy[n + k] = velocity[k]
-            dy[n + 3 + k] = load.force[m, k] / model.translation.mass - W[i] * V[j] + W[j] * V[i]
-    return OK
-
-
-@kernel(from_python=True)
-def is_singular(form, y, dy, dt):
-    """Whether theta is within a step of 0 or pi, or so near that phi and psi lose half of their digits."""
-    if form.variables != 3:
-        return False
-    s = abs(sin(y[1]))
-    return s <= SMALLEST_SINE or (s < NEAR_A_POLE and s <= dt * hypot(dy[1], dy[0] * s))
-
-
-@kernel(from_python=True)
-def rk4(form, model, terms, state, load, y, stages, dt, until, cursor):
-    """Classical Runge-Kutta until state.step is `until`. cursor (1,): stages done in a step; stages (5, variables)."""
-    shift = (0.0, 0.5, 0.5, 1.0)
-    while state.step[NOW] < until:
-        time = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
-        while cursor[0] < 4:
-            k = cursor[0]
-            for i in range(len(y)):
-                stages[4, i] = y[i] + shift[k] * dt * stages[max(k - 1, 0), i] if k else y[i]
-            status = write_rates(form, model, terms, state, load, time + shift[k] * dt, stages[4], stages[k])
-            if status != OK:
-                return status
-            if k == 0 and is_singular(form, y, stages[0], dt):
-                return SINGULAR
-            cursor[0] += 1
-        for i in range(len(y)):
-            y[i] += dt / 6 * (stages[0, i] + 2 * stages[1, i] + 2 * stages[2, i] + stages[3, i])
-        cursor[0] = 0
-        state.step[NOW] += 1
-    return OK
-
-
-class OdeEngine(Engine):
+class OdeEngine(CpuEngine):
     """An engine that moves a body by a general solver.
 
     The solver's variables are in `state.extra_variables`, and the rest of the state is computed from them. DOP853 and
@@ -157,15 +47,13 @@ class OdeEngine(Engine):
     _solver: Dop853 | Radau | None = None
     _dense_output: Callable[[float], np.ndarray] | None = None
     _restart = False  # whether forces have changed, so that earlier steps are useless
-    solver_steps = 0  # steps that DOP853 or Radau has taken
-    stop_requested: Callable[[], bool] = staticmethod(lambda: False)  # called at each of these steps
+    _steps = 0  # steps that DOP853 or Radau has taken
     _stiff_steps, _other_steps = 0, 0  # consecutive steps at the limit of stability and not, as Hairer counts them
-    is_stiff = False  # whether stability has limited the steps of DOP853 for long
+    is_stiff = False
 
     @property
-    def evaluations(self) -> int:
-        """Evaluations of the rates by DOP853 or Radau since its last start."""
-        return self._solver.nfev if self._solver is not None else 0
+    def chosen_steps(self) -> tuple[int, int] | None:
+        return None if self._solver is None else (self._steps, self._solver.nfev)
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         solver = _as_solver(integrator)
@@ -205,8 +93,6 @@ class OdeEngine(Engine):
         self._restart = False
 
     def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
-        """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
-        forces have not changed since."""
         solver, variables = _as_solver(integrator), len(state.extra_variables) // 3
         if solver.name != RK4:
             time, length = state.extra_variables[:2]
@@ -215,7 +101,7 @@ class OdeEngine(Engine):
                 raise ValueError("the last step of its solver is invalid")
             if start is not None and not np.array_equal(scales, self.variables(start, integrator)[2 + 2 * variables :]):
                 raise ValueError("the scales of its variables differ from the start")
-        repeated = state.copy()
+        repeated, memory = state.copy(), self.memory() or {}
         try:
             self.advance(repeated, integrator, dt, int(state.step[NOW]))
         except (SimulationError, ValueError) as error:
@@ -223,6 +109,7 @@ class OdeEngine(Engine):
         for name, found, given in zip(State._fields, repeated, state, strict=True):
             if not np.allclose(found, given, rtol=1e-9, atol=1e-9 * np.abs(given[np.isfinite(given)]).max(initial=0.0)):
                 raise ValueError(f"its state has another {name} than its variables")
+        self.recall(state, memory)
 
     def forget(self) -> None:
         super().forget()
@@ -257,7 +144,7 @@ class OdeEngine(Engine):
             with np.errstate(all="ignore"):
                 problem = running.step()
                 self._count_stiff(running)
-            self.solver_steps += 1
+            self._steps += 1
             if is_singular(form, running.y, running.y, 0.0):
                 raise SingularError(running.y[1], running.t)
             if problem or not np.isfinite(running.y).all():
@@ -285,7 +172,7 @@ class OdeEngine(Engine):
         moved = change > ROUNDED * np.linalg.norm(running.y)
         if moved and h * np.linalg.norm(stages[len(running.A)] - stages[len(running.A) - 1]) > STABLE * change:
             self._stiff_steps, self._other_steps = self._stiff_steps + 1, 0
-            self.is_stiff |= self._stiff_steps >= STIFF
+            self.is_stiff = self.is_stiff or self._stiff_steps >= STIFF
         else:
             self._other_steps += 1
             self._stiff_steps *= self._other_steps < MILD
