@@ -239,7 +239,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F34", "log: the pressures xz and yz exchanged",
-        "run/molecular.py",
+        "engines/observables.py",
         "pressure_xz=xz, pressure_yz=yz,",
         "pressure_xz=yz, pressure_yz=xz,",
         ("test_analyse_runs.py::test_results_in_memory_and_from_the_folder_agree",),

@@ -25,6 +25,7 @@ from rigidmd.assemble.build import build
 from rigidmd.compile import kernel
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NO_CELL, NOW, State
+from rigidmd.engines import observables
 from rigidmd.engines.cpu.engine import CpuEngine as Engine
 from rigidmd.engines.system import System
 from rigidmd.mechanics.free_rotor import rotate
@@ -71,6 +72,11 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
 def built(counts, edge, seed=0, spread=0.4, **sections) -> tuple[System, Engine, State]:
     """`shaken` of `small_scene`: system, engine, state."""
     return shaken(build(small_scene(counts, edge, **sections)), seed, spread)
+
+
+def observe(system: System, engine: Engine, state: State, **options):
+    """The observables of a state, with energies in u Å²/ps²."""
+    return observables.observe(system, engine, state, energy_unit=1.0, **options)
 
 
 def move(engine: Engine, state: State, scheme: Scheme, dt: float, steps: int) -> None:
@@ -286,7 +292,7 @@ HOMES = {
     "studies.accuracy.bias": "AverageRun AveragedQuantity Averages MeanAtStep extrapolate",
     "run.pilot.choice": "choose",
     "core.statistics": "correlation_time error_of_mean format_signed inefficiency mean_and_error slope",
-    "engines.observables": "Reading kinetic_energies observe",
+    "engines.observables": "Observation kinetic_energies",
     "run.user_force_check": "check_forces",
     "engines.samples": "BODY BODY_COLUMNS COLUMNS Sample Samples",
     "run.pilot.shadow": "bias_of_potential mean_square_rate",

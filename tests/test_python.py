@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Reading, load_model, small_scene
+from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Observation, load_model, small_scene
 
 import rigidmd
 from rigidmd.errors import SceneError
@@ -74,6 +74,11 @@ def test_observers_see_the_units_of_the_log():
             assert getattr(reading, name) == results[name][k]
         assert sum(reading.components.values()) == pytest.approx(reading.potential)
         assert reading.kinetic_translation == pytest.approx(kinetic, rel=1e-12)
+        for name in COLUMNS:
+            assert getattr(reading.sample, name) == pytest.approx(results[name][k], nan_ok=True)
+        assert reading.momentum.shape == (3,)
+        assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))
+        assert reading.sample.pressure_xy == reading.pressure_tensor_bar[0, 1]
     # forces are the slopes of the energy that is told
     system, engine, state = simulation.system, simulation.engine, simulation.state
     energy = []
@@ -81,7 +86,7 @@ def test_observers_see_the_units_of_the_log():
         state.position[0, 0] += shift
         energy.append(sum(tally.energy for tally in engine.evaluate(state)[1].values()) / KJ_PER_MOL)
         state.position[0, 0] -= shift
-    assert isinstance(seen[-1][0], Reading)
+    assert isinstance(seen[-1][0], Observation)
     assert seen[-1][0].force.shape == (len(system.model.species), 3)
     assert seen[-1][0].force[0, 0] == pytest.approx(-(energy[0] - energy[1]) / 2e-4, rel=1e-5, abs=1e-9)
 

@@ -754,7 +754,8 @@ def test_from_python_in_five_lines():
 
 def arrays_of(moment):
     """All arrays that a moment gives."""
-    given = [moment.site_positions, *moment.state, *moment.observation]
+    seen = moment.observation
+    given = [moment.site_positions, *moment.state, *seen, seen.force, seen.torque_body]
     return [part for part in given if isinstance(part, np.ndarray)]
 
 

@@ -12,12 +12,13 @@ from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.state import edges_and_angles
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.io.cells import edges_and_angles, right_angled
+from rigidmd.io.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.matching import NO_MASS, MatchedMolecules, massive_sites, match
 from rigidmd.assemble.memory_check import check_memory_of_molecules
+from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.k_vectors import SAME_BASIS
@@ -17,7 +18,6 @@ from rigidmd.io.cells import (
     cell_error,
     describe_basis,
     describe_cell,
-    edges_and_angles,
     least_skewed_cell,
     reduced_cell,
     right_angled,

@@ -1,6 +1,7 @@
 """The state: everything that evolves during a run, and nothing else. The load on its bodies, and status codes."""
 
-from math import inf
+from math import acos, degrees, hypot, inf
+from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +74,15 @@ class State(NamedTuple):
 STORED_NAMES = (*State._fields[:7], "books", "bath")
 #: The cell of a scene without a box.
 NO_CELL = np.diag([inf, inf, inf])
+
+
+def edges_and_angles(cell: np.ndarray) -> list[float]:
+    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3). NumPy would take ten times as long."""
+    a, b, c = cell.tolist()
+    edges = [hypot(*edge) for edge in (a, b, c)]
+    pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
+    angles = [degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs]
+    return [*edges, *angles]
 
 
 def state_of(

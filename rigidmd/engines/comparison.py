@@ -36,7 +36,7 @@ class Comparison(NamedTuple):
 
 def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Comparison]:
     """Compare energies by term, forces and torques on bodies, and the virial of two engines at a state."""
-    ours, theirs = observe(system, here, state), observe(system, there, state)
+    ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (here, there))
     virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
 
     kinetic = sum(kinetic_energies(system, state))

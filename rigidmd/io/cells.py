@@ -1,10 +1,10 @@
 """Periodic cells of any shape and orientation, as in structure files. Rows a, b, c, lab frame, Å."""
 
 from itertools import product
-from math import acos, degrees, hypot
-from operator import mul
 
 import numpy as np
+
+from rigidmd.core.state import edges_and_angles
 
 #: Largest cosine of right angles: files have angles to 0.01 degrees, vectors to 1e-5 or better.
 RIGHT = np.radians(1e-3)
@@ -102,15 +102,6 @@ def right_angled(cell: np.ndarray) -> bool:
     """Whether the edges of a cell (3, 3) are at right angles, to the digits of files."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]
     return bool(np.abs((unit @ unit.T)[np.triu_indices(3, 1)]).max() <= RIGHT)
-
-
-def edges_and_angles(cell: np.ndarray) -> list[float]:
-    """a, b, c (Å), alpha, beta, gamma (degrees) of a cell (3, 3). NumPy would take ten times as long."""
-    a, b, c = cell.tolist()
-    edges = [hypot(*edge) for edge in (a, b, c)]
-    pairs = ((b, c, edges[1] * edges[2]), (c, a, edges[2] * edges[0]), (a, b, edges[0] * edges[1]))
-    angles = [degrees(acos(max(min(sum(map(mul, u, v)) / size, 1.0), -1.0))) for u, v, size in pairs]
-    return [*edges, *angles]
 
 
 def pairs_within(

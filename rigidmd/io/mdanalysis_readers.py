@@ -14,7 +14,7 @@ from MDAnalysis.coordinates.TRR import TRRReader
 from MDAnalysis.coordinates.XTC import XTCReader
 from MDAnalysis.coordinates.XYZ import XYZReader
 
-from rigidmd.io.cells import edges_and_angles
+from rigidmd.core.state import edges_and_angles
 from rigidmd.io.formats.gsd import GsdReader
 from rigidmd.io.formats.traj import TrajReader
 

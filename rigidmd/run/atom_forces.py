@@ -28,6 +28,7 @@ from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.io.ase_atoms import EV
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.scene.models import Molecule
+from rigidmd.units import BAR
 
 #: Distance of a massless site from a linear combination of the atoms that is rounding, as a fraction of the radius.
 COMBINATION_TOLERANCE = 1e-9
@@ -51,13 +52,13 @@ def ase_results(
     still = state._replace(
         velocity=np.zeros_like(state.velocity), angular_momentum_body=np.zeros_like(state.angular_momentum_body)
     )
-    seen = observe(system, engine, still)
+    seen = observe(system, engine, still, energy_unit=EV)
     force = gradient_forces(system, state, seen.load, atoms)
     if form == "sites":
         force = site_forces(system, engine, state, seen.load, atoms)
-    found = {"energy": seen.potential / EV, "forces": force / EV}
+    found = {"energy": seen.potential, "forces": force / EV}
     if np.isfinite(state.cell).all():
-        found["stress"] = np.array([-seen.pressure_tensor[at] for at in VOIGT]) / EV
+        found["stress"] = np.array([-seen.pressure_tensor_bar[at] for at in VOIGT]) * (BAR / EV)
     return found
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import hypot, isfinite, nan
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
@@ -15,16 +15,15 @@ from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.compile.cache import describe_cache
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import HEAT, NOW, ORIGIN, REMOVED, WORK, State, state_of
+from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.dynamics.observables import LargestValues, largest_values
 from rigidmd.engines.observables import Observation, observe
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import COLUMNS, Sample, Samples
+from rigidmd.engines.samples import COLUMNS, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.io.ase_atoms import atoms_of_system
-from rigidmd.io.cells import edges_and_angles
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
@@ -49,7 +48,7 @@ from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.run.user_force_check import check_forces
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND, GRAM_PER_CM3, KJ_PER_MOL
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
 if TYPE_CHECKING:
     import ase
@@ -363,36 +362,15 @@ class MolecularSimulation(Simulation):
         return self.engine.extent(self.state)
 
     def _observe(self, moment: Moment) -> Observation:
+        """The observation at a moment. The drift of its stage is counted from the last sample before the stage."""
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
-        step = stage.timestep_fs * FEMTOSECOND if is_verlet else nan
-        return observe(self.system, self.engine, self.state, step, self.system.freedom_in(moment.stage), moved=True)
-
-    def sample_of(self, moment: Moment) -> Sample:
-        """A line of the log. Its drift is counted from the last sample before its stage."""
-        seen: Observation = moment._observation
-        energy, ledger = seen.energy / KJ_PER_MOL, self.state.energy_ledger / KJ_PER_MOL
-        conserved = energy - float(ledger.sum())
-        volume, stage = self.state.volume, self.scene.stages[moment.stage]
-        boxed = volume < np.inf
-        a, b, c, alpha, beta, gamma = edges_and_angles(self.state.cell) if boxed else [nan] * 6
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = seen.pressure_tensor_bar.tolist()
         # an external engine may not report the heat of its thermostat
-        known = not stage.is_minimisation and self.engine.conserves_energy
-        return Sample(
-            step=moment.step, time=moment.time, potential=seen.potential / KJ_PER_MOL,
-            kinetic=seen.kinetic / KJ_PER_MOL, energy=energy, temperature=seen.temperature,
-            volume=volume * 1e-3 if boxed else nan, density=self.system.mass / volume / GRAM_PER_CM3 if boxed else nan,
-            stage_name=stage.label, temperature_translation=seen.temperature_translation,
-            temperature_rotation=seen.temperature_rotation,
-            temperature_translation_unbiased=seen.temperature_translation_unbiased,
-            temperature_rotation_unbiased=seen.temperature_rotation_unbiased, pressure_bar=seen.pressure_bar,
-            drift=conserved - self._sampler.origin(moment.stage, conserved) if known else nan,
-            momentum=hypot(*seen.momentum.tolist()), orthogonality_error=seen.orthogonality_error, a=a, b=b, c=c,
-            alpha=alpha, beta=beta, gamma=gamma, heat=float(ledger[HEAT]), work=float(ledger[WORK]), pressure_xx=xx,
-            pressure_yy=yy, pressure_zz=zz, pressure_xy=xy, pressure_xz=xz, pressure_yz=yz, conserved=conserved,
-            stage=moment.stage,
-            user_energies=tuple(seen.components[name] / KJ_PER_MOL for name in self.system.user_terms),
+        conserves = not stage.is_minimisation and self.engine.conserves_energy
+        return observe(
+            self.system, self.engine, self.state, moment.stage, time=moment.time, moved=True,
+            origin=self._sampler.origin(moment.stage) if conserves else nan,
+            verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
         )  # fmt: skip
 
     def _default_observers(self) -> list[Observer]:
@@ -469,8 +447,8 @@ class MolecularSimulation(Simulation):
         """
         removal = self.start()
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
-        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state)
-        force, molecule = seen.largest_force
+        seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0)
+        forces = np.linalg.norm(seen.load.force, axis=1)
         found = {
             "unit": unit, "molecules": len(self.system.model.species), "relief_steps": removal.steps if removal else 0,
             "notes": list(self.system.notes),
@@ -478,7 +456,7 @@ class MolecularSimulation(Simulation):
             "potential": seen.potential / size, "kinetic": seen.kinetic / size,
             "virial": float(seen.virial.trace()) / size, "virial_tensor": (seen.virial / size).tolist(),
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
-            "largest_force_per_A": force / size, "largest_force_molecule": molecule + 1,
+            "largest_force_per_A": float(forces.max()) / size, "largest_force_molecule": int(forces.argmax()) + 1,
             "meaning": describe_quantities(self.system),
         }  # fmt: skip
         if measure_accuracy:

@@ -102,9 +102,9 @@ class Sampler(Observer):
     def files(self) -> list[str]:
         return [LAST_GOOD]
 
-    def origin(self, stage: int, conserved: float) -> float:
+    def origin(self, stage: int) -> float | None:
         """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else of its first."""
-        return self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else conserved
+        return self.samples.row(self._begins.get(stage, -1)).conserved if len(self.samples) else None
 
     def see(self, moment: Moment) -> None:
         run, now, samples = self._run, moment.sample, self.samples
@@ -113,14 +113,14 @@ class Sampler(Observer):
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:
             since = samples.latest(now.time - stage.thermostat_time, since)
-        seen = moment._observation
+        kinetic = now.kinetic * KJ_PER_MOL
         if not self._check.thermal:
-            self._check.rescale(seen.kinetic)
-        if problem := self._check.failed_check(run.state, seen.load, stage, run.extent):
+            self._check.rescale(kinetic)
+        if problem := self._check.failed_check(run.state, moment.observation.load, stage, run.extent):
             raise problem
         if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
             raise problem
-        self._check.rescale(seen.kinetic)
+        self._check.rescale(kinetic)
         self._keep(moment.step, moment.time)
 
     def _keep(self, step: int, time: float) -> None:

@@ -9,7 +9,7 @@ and with `ends` also at the last moment of every segment. A time at which a mini
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from rigidmd.io.folder import SCENE
 
 if TYPE_CHECKING:
     from rigidmd.engines.samples import Sample
-    from rigidmd.run.molecular import MolecularSimulation
     from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
 
@@ -47,19 +46,15 @@ class Moment:
         return State(*map(_read_only, self._state.copy()))
 
     @cached_property
-    def _observation(self) -> Any:
-        """The observation in internal units, evaluated at its first use, for all observers."""
+    def observation(self) -> Any:
+        """Evaluated at its first use, for all observers: an `Observation` of molecules, in the units of the log, or the
+        `Pose` of a body, in SI units."""
         return self._run._observe(self)
 
-    @cached_property
+    @property
     def sample(self) -> "Sample":
         """The line of the log; for molecules only."""
-        return cast("MolecularSimulation", self._run).sample_of(self)
-
-    @cached_property
-    def observation(self) -> Any:
-        """The observation: a `Reading` for molecules, in the units of the log; a `Pose` for a body, in SI units."""
-        return getattr(self._observation, "reading", self._observation)
+        return self.observation.sample
 
     @property
     def site_positions(self) -> np.ndarray:

@@ -379,7 +379,7 @@ class Simulation(Displayed, Base):
 
     @abstractmethod
     def _observe(self, moment: Moment) -> Any:
-        """The observation at a moment, in internal units; observers get its `reading` if it has one."""
+        """The observation at a moment; `Moment.observation` keeps it."""
 
     @abstractmethod
     def _default_observers(self) -> list[Observer]:

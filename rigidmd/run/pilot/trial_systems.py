@@ -69,7 +69,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
     state = start.copy()
     state.step[:] = 0
     state.begin_segment(0.0)
-    kinetic = observe(system, system.engine(), state).kinetic
+    kinetic = observe(system, system.engine(), state, energy_unit=1.0).kinetic
     freedom = max(system.freedom.total, 1)
     thermal = 2 * kinetic / freedom
     mass = system.model.mass[system.model.species]
@@ -90,12 +90,12 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
     return TrialSystem(
         name=system.scene.name, state=state,
         methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
-        energy=lambda engine, now: observe(system, engine, now).energy - float(now.energy_ledger.sum()),
+        energy=lambda engine, now: observe(system, engine, now, energy_unit=1.0).conserved,
         energy_unit="kT per degree of freedom", energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
         energy_size=freedom * thermal or 1.0, kinetic=kinetic or 1.0, span=span, time_unit="fs", time_size=FEMTOSECOND,
         length_unit="Å", reference="srkn_6", conserved_errors=conserved_errors, can_continue=True,
         refused={name: "it is for single bodies" for name in COMPARATORS},
-        observe=(lambda engine, now, step: observe(system, engine, now, step)) if boxed else None,
+        observe=(lambda engine, now, step: observe(system, engine, now, verlet_step=step)) if boxed else None,
         molecules=len(system.model.species), freedom=freedom,
     )  # fmt: skip
 

@@ -20,7 +20,6 @@ from rigidmd.engines.observables import Observation
 from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.units import KJ_PER_MOL
 
 #: Number of observations of the energy in a span.
 OBSERVATIONS = 40
@@ -411,7 +410,7 @@ def _average(system: TrialSystem, trial: Trial, length: float) -> None:
     def series(name: str) -> np.ndarray:
         return np.array([getattr(observation, name) for observation in seen])
 
-    found = {"potential": series("potential") / KJ_PER_MOL / system.molecules, "pressure": series("pressure_bar")}
+    found = {"potential": series("potential") / system.molecules, "pressure": series("pressure_bar")}
     for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
         on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
         # unbiased = (on the steps + twice between the kicks)/3
