@@ -80,7 +80,8 @@ def observe(
         tail_pressure = system.tail.pressure(volume)
     virial = sum((tally.virial for tally in tallies.values()), np.zeros((3, 3)))
     sums = engine.sums(state, load) or sums_of_state(system.model, state, load)
-    translation, rotation, potential = 0.5 * sums.translation, 0.5 * sums.rotation, sum(components.values())
+    translation, rotation = 0.5 * sums.translation, 0.5 * sums.rotation
+    potential, kinetic = sum(components.values()), translation + rotation
     correction = verlet_step**2 / 12
     freedom = system.freedom if stage is None else system.freedom_in(stage)
     if boxed := volume < inf:
@@ -90,12 +91,12 @@ def observe(
         pressure, (a, b, c, alpha, beta, gamma) = np.full((3, 3), nan), [nan] * 6
     tensor_bar = pressure / BAR
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor_bar.tolist()
-    energy, ledger = (potential + translation + rotation) / energy_unit, state.energy_ledger / energy_unit
+    energy, ledger = (potential + kinetic) / energy_unit, state.energy_ledger / energy_unit
     conserved = energy - float(ledger.sum())
     sample = Sample(
         step=int(state.step[NOW]), time=float(state.time[NOW]) if time is None else time,
-        potential=potential / energy_unit, kinetic=(translation + rotation) / energy_unit, energy=energy,
-        temperature=_temperature(translation + rotation, freedom.total), volume=volume * 1e-3 if boxed else nan,
+        potential=potential / energy_unit, kinetic=kinetic / energy_unit, energy=energy,
+        temperature=_temperature(kinetic, freedom.total), volume=volume * 1e-3 if boxed else nan,
         density=system.mass / volume / GRAM_PER_CM3 if boxed else nan,
         stage_name=system.scene.stages[stage or 0].label,
         temperature_translation=_temperature(translation, freedom.translation),
