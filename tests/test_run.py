@@ -1084,6 +1084,29 @@ def test_help_is_quick_and_imports_nothing_heavy():
     assert "example" in done.stdout
 
 
+def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
+    (tmp_path / "greet.py").write_text(
+        "from rigidmd.commands.arguments import command\n\n"
+        "def arguments(parser):\n    parser.add_argument('name', metavar='NAME', help='whom to greet')\n\n"
+        "@command(5, 'greet someone', 'rigidmd greet Ada', arguments)\n"
+        "def greet(options):\n    print(f'hello {options.name}')\n    return 3\n"
+    )
+    import rigidmd.commands
+    from rigidmd.commands.arguments import COMMANDS
+
+    monkeypatch.setattr(rigidmd.commands, "__path__", [*rigidmd.commands.__path__, str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    listed = capsys.readouterr().out
+    assert listed.index("greet someone") < listed.index("list the scenes")  # position 5 is before all others
+    assert main(["greet", "Ada"]) == 3
+    assert capsys.readouterr().out == "hello Ada\n"
+    with pytest.raises(SystemExit):
+        main(["gret"])
+    assert "did you mean greet?" in capsys.readouterr().err.replace("'", "")
+    del COMMANDS["greet"], sys.modules["rigidmd.commands.greet"]
+
+
 def test_version():
     assert rigidmd_command("--version").stdout.strip() == f"rigidmd {rigidmd.__version__}"
 

@@ -1,4 +1,4 @@
-"""Arguments that several commands have, and the reading of scenes."""
+"""The registry of commands, arguments that several of them have, and the reading of scenes."""
 
 import argparse
 import re
@@ -7,21 +7,35 @@ import sys
 from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
-from typing import Any, TypeAlias
-
-#: What the function `add` of each command is given.
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+from typing import Any, NamedTuple
 
 
-def add_command(
-    commands: Commands, name: str, function: Callable[[argparse.Namespace], int], about: str, example: str
-) -> argparse.ArgumentParser:
-    """Add a command, which calls function(options) and returns its exit code."""
-    description, epilog = about[0].upper() + about[1:] + ".", f"example:\n  {example}"
-    form = argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=about, description=description, epilog=epilog, formatter_class=form)
-    parser.set_defaults(command=function, writes=False)  # writes: its results are files, not what it prints
-    return parser
+class Command(NamedTuple):
+    position: int  # in the list of `rigidmd --help`
+    about: str
+    example: str
+    arguments: Callable[..., object]
+    call: Callable[[argparse.Namespace], int]
+
+
+#: The commands of the imported modules, by name.
+COMMANDS: dict[str, Command] = {}
+
+
+def command(
+    position: int, about: str, example: str, arguments: Callable[..., object] = lambda parser: None
+) -> Callable:
+    """Register a function as the command of its name, without underscores around it.
+
+    position : in the list of `rigidmd --help`; arguments(parser) : adds the arguments of the command
+    The function is called with the options, and returns the exit code.
+    """
+
+    def register(call: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+        COMMANDS[call.__name__.strip("_")] = Command(position, about, example, arguments, call)
+        return call
+
+    return register
 
 
 def number(kind: type, least: float, most: float, description: str) -> Callable[[str], Any]:

@@ -2,17 +2,16 @@
 
 import argparse
 
-from rigidmd.commands.arguments import Commands, add_command, add_engine, add_scene, read_scene
+from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene
 from rigidmd.commands.streams import warn
 
 
-def add(commands: Commands) -> None:
-    example = "rigidmd check water_nitrogen.toml"
-    check = add_command(commands, "check", _check, "describe a run without running it", example)
-    add_scene(check)
-    add_engine(check)
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_scene(parser)
+    add_engine(parser)
 
 
+@command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", _arguments)
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.assemble.describe import describe
     from rigidmd.run.pilot.stable_step import step_warnings

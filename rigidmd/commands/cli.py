@@ -1,6 +1,7 @@
-"""`rigidmd`: the list of commands, the parsing of the command line, the messages and exit codes of errors.
+"""`rigidmd`: the parsing of the command line, the messages and exit codes of errors.
 
-Commands compute nothing. Modules import what they need inside functions, so that `rigidmd --help` loads none of it.
+All modules of this package are imported; their functions with the decorator `command` are the commands. They compute
+nothing. Modules import what they need inside functions, so that `rigidmd --help` loads none of it.
 """
 
 import argparse
@@ -9,16 +10,13 @@ import sys
 import warnings
 from collections.abc import Iterator
 from importlib import import_module
+from pkgutil import iter_modules
 
+import rigidmd.commands as package
 from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
+from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
-
-#: The modules of the commands, in the order of `rigidmd --help`; view adds report, too.
-COMMANDS = (
-    "examples", "new", "run", "resume", "compare", "energy", "check", "export", "verify", "accuracy", "stability",
-    "analyse", "sweep", "view", "film", "gallery", "models", "schema", "help",
-)  # fmt: skip
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -111,8 +109,14 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
     parser = argparse.ArgumentParser("rigidmd", description=about, epilog=EXAMPLES, formatter_class=form)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for name in COMMANDS:
-        import_module(f"rigidmd.commands.{name}").add(commands)
+    for found in iter_modules(package.__path__):
+        import_module(f"{package.__name__}.{found.name}")
+    for name, command in sorted(COMMANDS.items(), key=lambda item: item[1].position):
+        description, epilog = command.about[0].upper() + command.about[1:] + ".", f"example:\n  {command.example}"
+        texts = {"help": command.about, "description": description, "epilog": epilog, "formatter_class": form}
+        of_command = commands.add_parser(name, **texts)
+        of_command.set_defaults(command=command.call, writes=False)  # writes: its results are files, not what it prints
+        command.arguments(of_command)
     return parser, commands.choices
 
 

@@ -5,18 +5,20 @@ import json
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.arguments import command
 
 
-def add(commands: Commands) -> None:
-    about = "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same "
-    about += "to the last bit, else 1"
-    compare = add_command(commands, "compare", _compare, about, "rigidmd compare runs/water runs/water2")
-    compare.add_argument("first", metavar="RUN", help="folder of a run")
-    compare.add_argument("second", metavar="RUN", help="folder of another run")
-    compare.add_argument("--json", action="store_true", help="print JSON")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("first", metavar="RUN", help="folder of a run")
+    parser.add_argument("second", metavar="RUN", help="folder of another run")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
+@command(
+    50, "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same to "
+    "the last bit, else 1",
+    "rigidmd compare runs/water runs/water2", _arguments,
+)  # fmt: skip
 def _compare(options: argparse.Namespace) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison
 

@@ -4,24 +4,23 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from rigidmd.commands.arguments import Commands, add_command, add_scene, read_scene
+from rigidmd.commands.arguments import add_scene, command, read_scene
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
 
 
-def add(commands: Commands) -> None:
-    example = "rigidmd energy water_dimer.toml --json"
-    energy = add_command(commands, "energy", _energy, "energies and forces of the start", example)
-    add_scene(energy)
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_scene(parser)
     units = ["kJ/mol", "kcal/mol", "eV", "K"]
-    energy.add_argument("--unit", choices=units, help="unit of energy (kJ/mol; J for a body)")
-    energy.add_argument("--json", action="store_true", help="print JSON")
-    energy.add_argument(
+    parser.add_argument("--unit", choices=units, help="unit of energy (kJ/mol; J for a body)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
         "--accuracy", action="store_true", help="also measure the error of the Coulomb forces (Ewald sums and PME)"
     )
 
 
+@command(60, "energies and forces of the start", "rigidmd energy water_dimer.toml --json", _arguments)
 def _energy(options: argparse.Namespace) -> int:
     from rigidmd.run import Simulation
     from rigidmd.scene import BodyScene

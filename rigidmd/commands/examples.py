@@ -2,14 +2,10 @@
 
 import argparse
 
-from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.arguments import command
 
 
-def add(commands: Commands) -> None:
-    about = "list the scenes, notebooks and scripts that rigidmd ships"
-    add_command(commands, "examples", _examples, about, "rigidmd examples")
-
-
+@command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
 def _examples(options: argparse.Namespace) -> int:
     from rigidmd.core.shipped import examples, notebooks, scripts
 

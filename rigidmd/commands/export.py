@@ -4,18 +4,19 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Commands, add_command, add_output_folder, add_scene, read_scene
+from rigidmd.commands.arguments import add_output_folder, add_scene, command, read_scene
 
 
-def add(commands: Commands) -> None:
-    about = "write a scene as a folder that runs on another engine by itself"
-    example = "rigidmd export water_pme.toml --to lammps -o water_lammps"
-    export = add_command(commands, "export", _export, about, example)
-    add_scene(export)
-    export.add_argument("--to", required=True, choices=["lammps", "openmm", "gromacs"], help="the engine")
-    add_output_folder(export, "NAME-ENGINE", "an earlier export")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_scene(parser)
+    parser.add_argument("--to", required=True, choices=["lammps", "openmm", "gromacs"], help="the engine")
+    add_output_folder(parser, "NAME-ENGINE", "an earlier export")
 
 
+@command(
+    80, "write a scene as a folder that runs on another engine by itself",
+    "rigidmd export water_pme.toml --to lammps -o water_lammps", _arguments,
+)  # fmt: skip
 def _export(options: argparse.Namespace) -> int:
     from rigidmd.studies.export import export
 

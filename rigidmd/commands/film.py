@@ -3,21 +3,20 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import Commands, add_command, add_run_folder, file_about_run, number
+from rigidmd.commands.arguments import add_run_folder, command, file_about_run, number
 from rigidmd.commands.streams import progress_bar
 
 
-def add(commands: Commands) -> None:
-    example = "rigidmd film runs/water -o water.mp4 --plots"
-    film = add_command(commands, "film", _film, "write the film of a run as a file", example)
-    add_run_folder(film, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_folder(parser, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
     length = number(float, 0.1, 3600, "a number of seconds from 0.1 to 3600")
     height = number(int, 100, 2160, "a number of pixels from 100 to 2160")
-    film.add_argument("--seconds", type=length, default=10.0, metavar="S", help="length of the film (default: 10)")
-    film.add_argument("--height", type=height, metavar="N", help="pixels (default: 640, of a .gif 448)")
-    film.add_argument("--plots", action="store_true", help="put plots with a moving cursor next to it")
+    parser.add_argument("--seconds", type=length, default=10.0, metavar="S", help="length of the film (default: 10)")
+    parser.add_argument("--height", type=height, metavar="N", help="pixels (default: 640, of a .gif 448)")
+    parser.add_argument("--plots", action="store_true", help="put plots with a moving cursor next to it")
 
 
+@command(150, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots", _arguments)
 def _film(options: argparse.Namespace) -> int:
     from rigidmd.view.animation import EXTENSIONS, check_writer, default_name, write_film
 

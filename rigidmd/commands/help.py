@@ -2,15 +2,14 @@
 
 import argparse
 
-from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.arguments import command
 
 
-def add(commands: Commands) -> None:
-    about = "list the chapters of the documentation, or print one"
-    chapters = add_command(commands, "help", _help, about, "rigidmd help water | less")
-    chapters.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them")
 
 
+@command(190, "list the chapters of the documentation, or print one", "rigidmd help water | less", _arguments)
 def _help(options: argparse.Namespace) -> int:
     from rigidmd.core.shipped import chapter_text, contents
 

@@ -4,17 +4,16 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.arguments import command
 
 
-def add(commands: Commands) -> None:
-    about = "copy a shipped scene, notebook or script to start from"
-    new = add_command(commands, "new", _new, about, "rigidmd new water -o mine.toml")
-    new.add_argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them")
-    new.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
-    new.add_argument("--force", action="store_true", help="replace that file")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them")
+    parser.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
+    parser.add_argument("--force", action="store_true", help="replace that file")
 
 
+@command(20, "copy a shipped scene, notebook or script to start from", "rigidmd new water -o mine.toml", _arguments)
 def _new(options: argparse.Namespace) -> int:
     from rigidmd.core.shipped import copy_example, find_example, series_of
     from rigidmd.scene import Scene

@@ -3,23 +3,22 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import Commands, add_command, add_trust
-from rigidmd.commands.run import add_duration, run_scene
+from rigidmd.commands.arguments import add_trust, command
+from rigidmd.commands.run import add_duration, run
 
 
-def add(commands: Commands) -> None:
-    example = "rigidmd resume runs/water --until 200ps"
-    resume = add_command(commands, "resume", _resume, "continue a run that was stopped", example)
-    resume.add_argument("folder", metavar="DIR", help="folder of the run")
-    add_trust(resume)
-    add_duration(resume)
-    resume.set_defaults(overrides=[], force=False, resume=True)
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", metavar="DIR", help="folder of the run")
+    add_trust(parser)
+    add_duration(parser)
+    parser.set_defaults(overrides=[], force=False, resume=True)
 
 
+@command(40, "continue a run that was stopped", "rigidmd resume runs/water --until 200ps", _arguments)
 def _resume(options: argparse.Namespace) -> int:
     from rigidmd.io.folder import SCENE, check_is_run
 
     folder = Path(options.folder)
     check_is_run(folder)
     options.scene, options.output = str(folder / SCENE), options.folder
-    return run_scene(options)
+    return run(options)

@@ -5,21 +5,20 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
-from rigidmd.commands.arguments import Commands, add_command, add_engine, add_scene, read_scene, seconds, time_ps
+from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
 
 
-def add(commands: Commands) -> None:
-    run = add_command(commands, "run", run_scene, "run a scene", "rigidmd run water.toml -o runs/water")
-    add_scene(run)
-    run.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
-    run.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
-    run.add_argument(
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_scene(parser)
+    parser.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
+    parser.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+    parser.add_argument(
         "--resume", action="store_true",
         help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start",
     )  # fmt: skip
-    add_engine(run)
-    add_duration(run)
+    add_engine(parser)
+    add_duration(parser)
 
 
 def add_duration(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +34,8 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run_scene(options: argparse.Namespace) -> int:
+@command(30, "run a scene", "rigidmd run water.toml -o runs/water", _arguments)
+def run(options: argparse.Namespace) -> int:
     from rigidmd.scene import BodyScene
 
     scene = read_scene(options)

@@ -3,14 +3,10 @@
 import argparse
 import json
 
-from rigidmd.commands.arguments import Commands, add_command
+from rigidmd.commands.arguments import command
 
 
-def add(commands: Commands) -> None:
-    about = "print the JSON schema of scenes, for editors"
-    add_command(commands, "schema", _schema, about, "rigidmd schema > scene.schema.json")
-
-
+@command(180, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json")
 def _schema(options: argparse.Namespace) -> int:
     from rigidmd.scene import schema
 

@@ -4,22 +4,22 @@ import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Commands, add_command, add_output_folder, command_line
+from rigidmd.commands.arguments import add_output_folder, command, command_line
 from rigidmd.commands.streams import progress_bar
 
 
-def add(commands: Commands) -> None:
-    about = (
-        "try to break the engine: named cases, each compared with a known answer; exit code 1 if an error is undetected"
-    )
-    example = "rigidmd stability --quick --case near_linear --case water_steps"
-    stability = add_command(commands, "stability", _stability, about, example)
-    stability.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
-    stability.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
-    add_output_folder(stability, "runs/stability")
-    stability.set_defaults(scene="stability")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
+    parser.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
+    add_output_folder(parser, "runs/stability")
+    parser.set_defaults(scene="stability")
 
 
+@command(
+    110,
+    "try to break the engine: named cases, each compared with a known answer; exit code 1 if an error is undetected",
+    "rigidmd stability --quick --case near_linear --case water_steps", _arguments,
+)  # fmt: skip
 def _stability(options: argparse.Namespace) -> int:
     import platform
 

@@ -4,19 +4,20 @@ import argparse
 import json
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import Commands, add_command, add_engine, add_scene, read_scene
+from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene
 
 
-def add(commands: Commands) -> None:
-    about = "compute a scene on two engines and compare energies by term, forces, virial, and a short run; exit code 0 "
-    about += "if they agree, else 1"
-    example = "rigidmd verify water_pme.toml --engine lammps --ranks 2"
-    verify = add_command(commands, "verify", _verify, about, example)
-    add_scene(verify)
-    add_engine(verify, "lammps or openmm", "the scene's, or lammps; openmm on its platform Reference")
-    verify.add_argument("--json", action="store_true", help="print JSON")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    add_scene(parser)
+    add_engine(parser, "lammps or openmm", "the scene's, or lammps; openmm on its platform Reference")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
+@command(
+    90, "compute a scene on two engines and compare energies by term, forces, virial, and a short run; exit code 0 if "
+    "they agree, else 1",
+    "rigidmd verify water_pme.toml --engine lammps --ranks 2", _arguments,
+)  # fmt: skip
 def _verify(options: argparse.Namespace) -> int:
     from rigidmd.scene import MolecularScene
     from rigidmd.studies.verify import verify
