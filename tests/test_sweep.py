@@ -400,7 +400,7 @@ def test_a_killed_worker_loses_its_point_alone_and_a_signal_stops_all(argon, who
             died.append(name)
         elif kind == "fraction" and not killed:
             killed.append(name)
-            next(worker for worker in pool._busy if worker.task["name"] == name).kill()
+            pool.busy[name].kill()
         elif kind == "fraction" and died:
             os.kill(os.getpid(), signal.SIGTERM)
 

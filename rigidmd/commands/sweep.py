@@ -106,8 +106,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     from rigidmd.io.progress import progress_of
-    from rigidmd.studies.sweep.cluster import Cluster
-    from rigidmd.studies.sweep.processes import Pool
+    from rigidmd.studies.sweep.backends import Cluster, Pool
     from rigidmd.studies.sweep.running import SweepOutcome, run_points
     from rigidmd.studies.sweep.sweeping import collect, jobs_and_threads
 

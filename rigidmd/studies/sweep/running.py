@@ -12,10 +12,9 @@ from typing import Any
 from rigidmd.run.checkpoints import checked_walltime
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import Scene
-from rigidmd.studies.sweep.cluster import Cluster
+from rigidmd.studies.sweep.backends import Cluster, Pool
 from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Manifest, SweepPoint, write_manifest
 from rigidmd.studies.sweep.plan import update_state
-from rigidmd.studies.sweep.processes import Message, Pool
 from rigidmd.studies.sweep.worker import PointTask
 
 #: Seconds between two checks of the time, and between two writings of the manifest.
@@ -46,7 +45,7 @@ def run_points(
 
     walltime : seconds after which all has to have ended
     trust : Python files that the scene may run
-    receive : called with (point, kind, value) of every `Message`
+    receive : called with (point, kind, value) of each message of the backend
 
     Raises OutputError if the manifest cannot be written.
     """
@@ -77,22 +76,30 @@ def run_points(
                 break
             if found.signal is not None:
                 runner.kill() if pressed > 1 else runner.stop()
-            for name, message in runner.messages(TICK):
+            for name, kind, value in runner.messages(TICK):
                 if name not in busy:  # a cluster may deliver late
                     continue
-                if message.kind != "died" or found.signal is None:  # else it was stopped before its first step
-                    receive(name, *message)
-                point = by_name[name]
-                if message.kind == "begun":
-                    waiting.compiled(point)
-                    point.state, point.message = RUNNING, None
-                elif message.kind in ("ended", "died"):
-                    busy.discard(name)
-                    waiting.compiled(point)
-                    _store_end(folder, point, message, found)
-                else:
+                if kind != "died" or found.signal is None:  # else it was stopped before its first step
+                    receive(name, kind, value)
+                if kind not in ("begun", "ended", "died"):
                     continue
-                changed = True
+                changed, point = True, by_name[name]
+                waiting.compiled(point)
+                if kind == "begun":
+                    point.state, point.message = RUNNING, None
+                    continue
+                busy.discard(name)
+                if kind == "ended":
+                    point.state, point.message, point.ran_sha256 = value["state"], value["message"], value["sha256"]
+                    point.seconds += value["seconds"]
+                    found.out_of_time |= value["out_of_time"]
+                elif found.signal is None:
+                    point.state, point.message = FAILED, value
+                else:  # it was stopped before it sent its end
+                    point.state = INTERRUPTED
+                    update_state(folder, point)
+                if point.state in (FINISHED, FAILED):
+                    (found.finished if point.state == FINISHED else found.failed).append(name)
             if changed and clock.monotonic() - written > WRITING_INTERVAL:
                 write_manifest(folder, manifest)
                 changed, written = False, clock.monotonic()
@@ -103,35 +110,14 @@ def run_points(
     return found
 
 
-def _store_end(folder: Path, point: SweepPoint, message: Message, found: SweepOutcome) -> None:
-    if message.kind == "died":
-        if found.signal is not None:  # it was stopped before it sent its end
-            point.state = INTERRUPTED
-            update_state(folder, point)
-        else:
-            point.state, point.message = FAILED, message.value
-    else:
-        ended = message.value
-        point.state, point.message, point.ran_sha256 = ended["state"], ended["message"], ended["sha256"]
-        point.seconds += ended["seconds"]
-        found.out_of_time |= ended["out_of_time"]
-    if point.state in (FINISHED, FAILED):
-        (found.finished if point.state == FINISHED else found.failed).append(point.folder)
-
-
 def task_of(
     folder: Path, manifest: Manifest, point: SweepPoint, ends_at: float | None = None, trust: Sequence[str] = ()
 ) -> PointTask:
     return {
-        "folder": str(folder.absolute()),
-        "name": point.folder,
-        "scene": manifest.scene,
-        "overrides": manifest.overrides(point),
-        "trust": [str(Path(path).absolute()) for path in trust],
-        "sha256": point.scene_sha256,
-        "ran_sha256": point.ran_sha256,
-        "ends_at": ends_at,
-    }
+        "folder": str(folder.absolute()), "name": point.folder, "scene": manifest.scene,
+        "overrides": manifest.overrides(point), "trust": [str(Path(path).absolute()) for path in trust],
+        "sha256": point.scene_sha256, "ran_sha256": point.ran_sha256, "ends_at": ends_at,
+    }  # fmt: skip
 
 
 class Waiting:

@@ -18,6 +18,7 @@ from rigidmd.io.write import write_csv
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.axes import Axis, axes_of, check_axes
+from rigidmd.studies.sweep.backends import Pool
 from rigidmd.studies.sweep.figure import draw_sweep
 from rigidmd.studies.sweep.folder import (
     FINISHED,
@@ -32,7 +33,6 @@ from rigidmd.studies.sweep.folder import (
     write_manifest,
 )
 from rigidmd.studies.sweep.plan import merge_manifests, order_axes, read_points, update_state
-from rigidmd.studies.sweep.processes import Pool
 from rigidmd.studies.sweep.running import run_points, task_of
 from rigidmd.studies.sweep.table import Table, table_of
 from rigidmd.studies.sweep.worker import PointResult, Send, run_task

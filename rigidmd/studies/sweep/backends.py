@@ -1,0 +1,230 @@
+"""Where the points of a sweep run: on this machine, or on a cluster of dask.distributed with a common file system.
+
+Both are executors of concurrent.futures, whose threads each watch a process that runs one point. A ProcessPoolExecutor
+cannot do that: it loses all points when one process is killed, and cannot stop a point with a checkpoint. When dask
+moves a point to another worker, it continues there from its last checkpoint.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rigidmd.core.files import write_text
+from rigidmd.errors import RigidMDError, SettingError
+from rigidmd.studies.sweep.folder import STOP
+from rigidmd.studies.sweep.worker import PointResult, PointTask, Send
+
+#: Seconds between two checks of whether to stop, and of waiting for a scheduler.
+POLL_INTERVAL, CONNECT_TIMEOUT = 0.2, 20.0
+LOCAL = "local"
+#: Number of the last letters of a worker's standard error that the message about its death may show.
+LAST_LETTERS = 400
+
+
+class Worker:
+    """A process with a number of threads that runs one task at a time in a working directory (default: this one)."""
+
+    def __init__(self, threads: int, folder: str | None = None):
+        counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the process lives)
+        # In a separate session: Ctrl-C goes only to its parent, which ends it with a checkpoint
+        self._process: Any = subprocess.Popen(
+            [sys.executable, "-m", "rigidmd.studies.sweep.worker"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, env=os.environ | counts, cwd=folder,
+            start_new_session=True,
+        )  # fmt: skip
+
+    def run(self, task: PointTask, must_stop: Callable[[], bool], send: Send) -> PointResult:
+        """Run a task, pass its messages on, and stop it with a checkpoint. Raises RigidMDError if the process dies."""
+        with contextlib.suppress(BrokenPipeError):  # it has died, which the end of its messages will show
+            self._process.stdin.write(json.dumps(task).encode() + b"\n")
+            self._process.stdin.flush()
+        rest, stopped = b"", False
+        while True:
+            if not stopped and must_stop():  # a second signal would end it at once
+                stopped = True
+                self._process.send_signal(signal.SIGTERM)
+            if not select.select([self._process.stdout], [], [], POLL_INTERVAL)[0]:
+                continue
+            if not (read := os.read(self._process.stdout.fileno(), 1 << 16)):
+                raise RigidMDError(self._death_reason())
+            *lines, rest = (rest + read).split(b"\n")
+            for kind, value in map(json.loads, lines):
+                if kind == "ended":
+                    return value
+                send(kind, value)
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def close(self) -> None:
+        """End the process; a run in it ends with a checkpoint."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()
+        self._process.wait()
+        self._stderr.close()
+
+    def _death_reason(self) -> str:
+        code = self._process.wait()
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip()[-LAST_LETTERS:].splitlines()
+        last = f": {lines[-1]}" if lines else ""
+        if code == -signal.SIGKILL:
+            return "its process was killed, perhaps because memory was full (run fewer points at a time: --jobs)"
+        if code < 0:
+            return f"its process was ended by {signal.Signals(-code).name}{last}"
+        return f"its process ended with exit code {code}{last}"
+
+
+class Backend:
+    """Runs points by run(task) on an executor. capacity() : number of points that it accepts at a time"""
+
+    def __init__(self, executor: Executor, capacity: Callable[[], int], run: Callable[[PointTask], PointResult]):
+        self._executor, self._capacity, self._run = executor, capacity, run
+        self._running: dict[str, Future] = {}
+        self._messages: queue.SimpleQueue[tuple[str, str, Any]] = queue.SimpleQueue()
+
+    @property
+    def free(self) -> int:
+        """Number of points that it would accept now."""
+        return self._capacity() - len(self._running)
+
+    def submit(self, task: PointTask) -> None:
+        future = self._running[task["name"]] = self._executor.submit(self._run, task)
+        future.add_done_callback(partial(self._end, task["name"]))
+
+    def _end(self, name: str, future: Future) -> None:
+        try:
+            self._messages.put((name, "ended", future.result()))
+        except RigidMDError as error:
+            self._messages.put((name, "died", str(error)))
+        except (Exception, CancelledError) as error:  # of the executor
+            self._messages.put((name, "died", f"it failed to run: {type(error).__name__}: {error}"))
+
+    def messages(self, seconds: float) -> list[tuple[str, str, Any]]:
+        """(point, kind, value) of messages that come within this time: those of `run_task`, ended, or died with why."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            found.append(self._messages.get(timeout=seconds))
+            while True:
+                found.append(self._messages.get_nowait())
+        for name, kind, _ in found:
+            if kind in ("ended", "died"):
+                self._running.pop(name, None)
+        return found
+
+
+class Pool(Backend):
+    """Up to `jobs` processes of this machine with `threads` each. Idle ones keep what they have loaded."""
+
+    def __init__(self, jobs: int, threads: int):
+        super().__init__(ThreadPoolExecutor(jobs), lambda: jobs, self._run_here)
+        self._threads, self._stopping = threads, threading.Event()
+        self._idle: list[Worker] = []
+        self.busy: dict[str, Worker] = {}  # by the name of the point
+
+    def _run_here(self, task: PointTask) -> PointResult:
+        name = task["name"]
+        worker = self.busy[name] = self._idle.pop() if self._idle else Worker(self._threads)
+        try:
+            ended = worker.run(task, self._stopping.is_set, lambda *message: self._messages.put((name, *message)))
+            self._idle.append(worker)
+            return ended
+        except RigidMDError:
+            worker.close()
+            raise
+        finally:
+            del self.busy[name]
+
+    def stop(self) -> None:
+        """Stop all runs at their next observations, with checkpoints."""
+        self._stopping.set()
+
+    def kill(self) -> None:
+        """Stop all runs without waiting for their ends."""
+        for worker in list(self.busy.values()):
+            worker.kill()
+
+    def close(self) -> None:
+        self.stop()
+        self._executor.shutdown(cancel_futures=True)
+        for worker in self._idle:
+            worker.close()
+
+
+class Cluster(Backend):
+    """Runs points on a cluster.
+
+    address : address of its scheduler, tcp://HOST:8786, or "local" for a cluster of `jobs` threads in this process
+    threads : threads of each point
+    working_directory : of the points
+
+    Raises SettingError without dask.distributed, or if nothing answers.
+    """
+
+    def __init__(self, address: str, jobs: int, threads: int, folder: Path, working_directory: Path):
+        try:
+            from distributed import Client, LocalCluster
+        except ImportError:
+            raise SettingError("--scheduler needs dask.distributed: pip install 'rigidmd[dask]'") from None
+        self._local_cluster = None
+        try:
+            if address == LOCAL:
+                # Threads, since the points run in separate processes
+                quiet: dict[str, Any] = {"dashboard_address": None, "silence_logs": logging.ERROR}
+                self._local_cluster = LocalCluster(n_workers=1, threads_per_worker=jobs, processes=False, **quiet)
+            client: Any = Client(self._local_cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise SettingError(
+                f"--scheduler {address}: no scheduler of dask.distributed answers ({error}); start one with `dask "
+                "scheduler` and workers with `dask worker`"
+            ) from None
+        # two points per thread of its workers, so that none is ever idle
+        capacity, topic = lambda: max(1, 2 * sum(client.nthreads().values())), f"rigidmd-{client.id}"
+        run = partial(_run_on_cluster, threads=threads, topic=topic, working_directory=str(working_directory))
+        super().__init__(client.get_executor(pure=False), capacity, run)
+        client.subscribe_topic(topic, lambda event: self._messages.put(tuple(event[1])))
+        self._client, self._stop = client, folder.absolute() / STOP
+        self._stop.unlink(missing_ok=True)
+
+    def stop(self) -> None:
+        """Stop all runs, with checkpoints, by a file that their workers check for."""
+        write_text(self._stop, "")
+
+    def kill(self) -> None:
+        self.stop()
+        for name in list(self._running):
+            self._messages.put((name, "died", "it was abandoned"))
+
+    def close(self) -> None:
+        """Leave the cluster, and end it if it was started here."""
+        self._client.close()
+        if self._local_cluster is not None:
+            self._local_cluster.close()
+        if not self._running:
+            self._stop.unlink(missing_ok=True)
+
+
+def _run_on_cluster(task: PointTask, threads: int, topic: str, working_directory: str) -> PointResult:
+    """Run a point in a process of this worker of dask, and send its messages to the topic."""
+    from distributed import get_worker
+
+    worker, dask_worker, stop = Worker(threads, working_directory), get_worker(), Path(task["folder"]) / STOP
+    try:
+        return worker.run(task, stop.exists, lambda *message: dask_worker.log_event(topic, [task["name"], *message]))
+    finally:
+        worker.close()
