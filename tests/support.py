@@ -319,7 +319,7 @@ HOMES = {
     "scene.models": (
         "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters with_masses"
     ),
-    "studies.accuracy.averages_report": "brief_rows describe_failures",
+    "studies.accuracy.averages_report": "brief_table describe_failures",
     "io.checkpoint": "Checkpoint latest read_checkpoint write_checkpoint",
     "figures.style": "AT_ONCE FAINT INK save_figure shown_range",
     "io.folder": "CHECKPOINT FINAL FolderLock LOG PREVIOUS check_folder",
@@ -327,7 +327,7 @@ HOMES = {
     "view.molecule_figure": "draw_molecule",
     "view.molecule_text": "models_table",
     "figures.picture": "Picture",
-    "studies.accuracy.report": "write_accuracy",
+    "studies.accuracy.report": "trial_table write_accuracy",
     "io.mdanalysis_readers": "FORMATS",
     "run.record": "read_record",
     "run.report": "summary_text",
@@ -379,7 +379,6 @@ RENAMED = {
     "openmm_unsupported": "engines.openmm.system:unsupported_features",
     "own_energy_and_force": "forces.potentials.custom:energy_and_force",
     "accuracy_recommendations": "studies.accuracy.report:recommendations",
-    "accuracy_row": "studies.accuracy.report:trial_row",
     "accuracy_table": "studies.accuracy.report:table_text",
     "stability_failed": "studies.stability.report:has_failed",
     "stability_picture": "studies.stability.report:picture",

@@ -30,10 +30,10 @@ from support import (
     small_scene,
     springs,
     time_span,
+    trial_table,
     write_accuracy,
 )
 from support import accuracy_recommendations as recommendations
-from support import accuracy_row as row
 from support import accuracy_table as table_text
 
 from rigidmd.commands.cli import main
@@ -170,7 +170,7 @@ def test_a_spread_is_shown_and_warned_of_and_none_is_claimed_of_one_timing(tmp_p
         return found, "\n".join(recommendations(found))
 
     found, words = told((1.0, 1.1, 1.19), (1.0, 1.0, 1.0))
-    assert [row(found, trial)[4] for trial in found.trials] == pytest.approx([100 * 0.19 / 1.1, 0])
+    assert [trial_table(found).values(trial)[4] for trial in found.trials] == pytest.approx([100 * 0.19 / 1.1, 0])
     assert "warning" not in words
     found, words = told((1.0, 1.1, 1.15), (1.0, 1.1, 1.4), (1.0, 2.0, 1.5))
     assert "warning: repeated timings of 2 of 3 trials differ by more than 20%" in words

@@ -7,7 +7,7 @@ from support import (
     AveragedQuantity,
     AverageRun,
     Averages,
-    brief_rows,
+    brief_table,
     correlation_time,
     describe_failures,
     error_of_mean,
@@ -119,7 +119,7 @@ def test_values_without_an_error_are_printed_as_such():
     assert told == (
         "baoab + langevin at 2 fs: U: 5 ps are too short for an error; sample longer (--sample-ps)"
     )  # of what is reported
-    assert brief_rows(found)[0][-2:] == ["-", "+0.5 ± 1.0"]
+    assert brief_table(found).shown()[1][0][-2:] == ["-", "+0.5 ± 1.0"]
 
 
 def test_inefficiency_of_correlated_samples():

@@ -277,8 +277,7 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     (copied / "notes.txt").write_text("mine")
     (copied / "temperature_K=90_seed=1" / "mine.txt").write_text("mine")
     with ExitStack() as stack:
-        wanted = sweeping.SweepRequest(argon, [Axis(("seed",), (1, 2))], copied, force=True)
-        assert sweeping.open_sweep(wanted, stack).left == 2
+        assert sweeping.open_sweep(stack, argon, [Axis(("seed",), (1, 2))], copied, force=True).left == 2
     assert [path.name for path in copied.iterdir() if path.is_dir()] == ["temperature_K=90_seed=1"]
     assert [path.name for path in (copied / "temperature_K=90_seed=1").iterdir()] == ["mine.txt"]
     assert {path.name for path in copied.iterdir() if path.is_file() and not path.name.startswith(".")} == {
@@ -377,7 +376,7 @@ def long_sweep(argon, folder, **more):
         "seed": range(1, 4),
     } | more
     with ExitStack() as stack:
-        return sweeping.open_sweep(sweeping.SweepRequest(argon, sweeping.axes_of(changes), folder), stack).manifest
+        return sweeping.open_sweep(stack, argon, sweeping.axes_of(changes), folder).manifest
 
 
 @pytest.fixture(scope="module")

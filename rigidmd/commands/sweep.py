@@ -66,7 +66,7 @@ def _sweep(options: argparse.Namespace) -> int:
 
     from rigidmd.errors import OutputError
     from rigidmd.studies.sweep.axes import parse_axes
-    from rigidmd.studies.sweep.sweeping import SweepRequest, open_existing_sweep, open_sweep
+    from rigidmd.studies.sweep.sweeping import open_existing_sweep, open_sweep
 
     _check(options)
     folder = Path(options.output) if options.output else None
@@ -78,8 +78,8 @@ def _sweep(options: argparse.Namespace) -> int:
                 raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
             return _collect(open_existing_sweep(folder, stack))
         axes = parse_axes(options.sets)
-        request = SweepRequest(Path(options.scene), axes, folder, options.replicas, options.trust, options.force)
-        sweep = open_sweep(request, stack)
+        scene, force = Path(options.scene), options.force
+        sweep = open_sweep(stack, scene, axes, folder, options.replicas, options.trust, force)
         if options.collect:
             return _collect(sweep)
         if options.to is not None:

@@ -3,10 +3,10 @@
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, save_figure, settings
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, drawing, save_figure, settings
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
@@ -26,6 +26,12 @@ def page(title: str, parts: Iterable[str], head: str = "") -> str:
     )
 
 
+def write_page(path: Path, make: Callable[[], str]) -> None:
+    """Write a page with figures; see `figures.style.drawing`."""
+    with drawing(path) as temporary:
+        temporary.write_text(make(), encoding="utf-8")
+
+
 def section(title: str, *parts: str, anchor: str = "") -> str:
     """A heading (plain text) and HTML parts; empty without any part."""
     if not any(parts):
@@ -34,11 +40,16 @@ def section(title: str, *parts: str, anchor: str = "") -> str:
     return f"<section><h2{name}>{html.escape(title)}</h2>\n" + "\n".join(part for part in parts if part) + "</section>"
 
 
-def table(titles: Sequence[str], rows: Iterable[Sequence[object]], words: bool = False) -> str:
-    """A table of plain text, which scrolls if it is too wide. words: cells are sentences, aligned left."""
+def table(
+    titles: Sequence[str], rows: Iterable[Sequence[object]], words: bool = False, marked: Mapping[str, object] = {}
+) -> str:
+    """A table of plain text, which scrolls if it is too wide. words: cells are sentences, aligned left. marked: cell of
+    the first column -> what is shown instead, such as one of `chips`"""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
     kind = ' class="words"' if words else ""
-    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>\n" for row in rows)
+    body = "".join(
+        f"<tr>{_cell(marked.get(str(first), first))}{''.join(map(_cell, rest))}</tr>\n" for first, *rest in rows
+    )
     top = f"<thead><tr>{head}</tr></thead>" if titles else ""
     return f'<div class="scroll"><table{kind}>{top}<tbody>\n{body}</tbody></table></div>' if body else ""
 

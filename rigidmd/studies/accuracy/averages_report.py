@@ -1,13 +1,15 @@
 """Report of `rigidmd accuracy --averages`: a table, conclusions, accuracy.csv and .json, averages.png and .html."""
 
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, curve_style, drawing, open_axis, write_figure
-from rigidmd.io.write import columns_text, write_csv, write_json
+from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, write_figure
+from rigidmd.io.table import Column, Table, with_error
+from rigidmd.io.write import write_json
 from rigidmd.studies.accuracy.bias import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
-from rigidmd.view.page import chips, code, items, page, plain, section, table, wide
+from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
 
@@ -23,42 +25,42 @@ def describe_scale(quantity: AveragedQuantity) -> str:
     return "N kT/V" if quantity.name == "pressure" else "its value"
 
 
-def csv_headers(found: Averages) -> list[str]:
-    titles = ["integrator", "thermostat", "step (fs)", "forces per ps", "seconds per ns"]
-    for quantity in found.quantities:
-        titles += [f"{quantity.name} ({quantity.unit})", "±", f"bias of {quantity.name} ({_bias_unit(quantity)})", "±"]
-    return [*titles, "failure"]
+def full_table(found: Averages) -> Table:
+    """Means and biases of all runs, with their errors."""
+
+    def mean(run: AverageRun, quantity: AveragedQuantity) -> Sequence[float] | None:
+        return (point := found.point(run, quantity)) and point[2:]
+
+    columns = [
+        Column("integrator", lambda run: run.integrator), Column("thermostat", lambda run: run.thermostat),
+        Column("step (fs)", lambda run: run.timestep), Column("forces per ps", lambda run: run.forces_per_ps),
+        Column("seconds per ns", lambda run: run.seconds_per_ns),
+    ]  # fmt: skip
+    for q in found.quantities:
+        columns += with_error(f"{q.name} ({q.unit})", lambda run, q=q: mean(run, q))
+        columns += with_error(f"bias of {q.name} ({_bias_unit(q)})", lambda run, q=q: found.bias(run, q))
+    return Table([*columns, Column("failure", lambda run: run.failure)], found.runs)
 
 
-def csv_row(found: Averages, run: AverageRun) -> list:
-    values: list = [run.integrator, run.thermostat, run.timestep, run.forces_per_ps, run.seconds_per_ns]
-    for quantity in found.quantities:
-        point, bias = found.point(run, quantity), found.bias(run, quantity)
-        values += [None, None, None, None] if point is None or bias is None else [point.mean, point.error, *bias]
-    return [*values, run.failure]
+def brief_table(found: Averages) -> Table:
+    """Biases with their errors, as text."""
 
+    def bias(run: AverageRun, quantity: AveragedQuantity) -> str | None:
+        return (found_bias := found.bias(run, quantity)) and format_signed(*found_bias)
 
-def brief_headers(found: Averages) -> list[str]:
-    titles = ["method", "step (fs)", "forces/ps", "s/ns"]
-    return titles + [f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})" for q in found.quantities]
-
-
-def brief_rows(found: Averages) -> list[list[str]]:
-    """Lines of the printed table: biases with their errors."""
-    lines = []
-    for run in found.runs:
-        seconds = "-" if run.seconds_per_ns is None else f"{run.seconds_per_ns:.3g}"
-        cells = [run.method, f"{run.timestep:g}", f"{run.forces_per_ps:.4g}", "fails" if run.failure else seconds]
-        for quantity in found.quantities:
-            bias = found.bias(run, quantity)
-            cells.append(format_signed(*bias) if bias else "-")
-        lines.append(cells)
-    return lines
+    return Table([
+        Column("method", lambda run: run.method),
+        Column("step (fs)", lambda run: f"{run.timestep:g}"),
+        Column("forces/ps", lambda run: f"{run.forces_per_ps:.4g}"),
+        Column("s/ns", lambda run: "fails" if run.failure else run.seconds_per_ns),
+        *(Column(f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})", lambda run, q=q: bias(run, q))
+          for q in found.quantities),
+    ], found.runs)  # fmt: skip
 
 
 def table_text(found: Averages) -> str:
     text = f"bias of averages over {found.sampled:g} ps of {found.stage} (U in kT per degree of freedom)\n"
-    return text + columns_text([brief_headers(found), *brief_rows(found)])
+    return text + brief_table(found).text()
 
 
 def bias_conclusions(found: Averages) -> list[str]:
@@ -113,27 +115,21 @@ def describe_failures(found: Averages) -> list[str]:
 
 
 def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
-    write_csv(folder / FILES[0], [csv_headers(found), *(csv_row(found, run) for run in found.runs)])
+    full_table(found).write(folder / FILES[0])
     write_json(folder / FILES[1], to_json(found, command), indent=2, allow_nan=False)
     title = f"{found.name}: bias of averages over {found.sampled:g} ps"
     write_figure(folder / FILES[2], lambda: figure_of(found), title)
-    with drawing(folder / FILES[3]) as temporary:
-        temporary.write_text(averages_page(found, command), encoding="utf-8")
+    write_page(folder / FILES[3], lambda: averages_page(found, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
 def to_json(found: Averages, command: str) -> dict:
+    quantities = {quantity.name: _quantity_to_json(found, quantity) for quantity in found.quantities}
     return {
-        "command": command,
-        "scene": found.name,
-        "stage": found.stage,
-        "temperature_K": found.temperature,
-        "molecules": found.molecules,
-        "degrees_of_freedom": found.freedom,
-        "sampled_ps": found.sampled,
-        "quantities": {quantity.name: _quantity_to_json(found, quantity) for quantity in found.quantities},
-        "runs": [_run_to_json(found, run) for run in found.runs],
-    }
+        "command": command, "scene": found.name, "stage": found.stage, "temperature_K": found.temperature,
+        "molecules": found.molecules, "degrees_of_freedom": found.freedom, "sampled_ps": found.sampled,
+        "quantities": quantities, "runs": [_run_to_json(found, run) for run in found.runs],
+    }  # fmt: skip
 
 
 def _quantity_to_json(found: Averages, quantity: AveragedQuantity) -> dict:
@@ -142,14 +138,11 @@ def _quantity_to_json(found: Averages, quantity: AveragedQuantity) -> dict:
         return {"unit": quantity.unit}
     steps = {method: at for method in methods_of(found) if (at := found.step_at_limit(method, quantity))}
     return {
-        "unit": quantity.unit,
-        "bias_unit": _bias_unit(quantity),
-        "reference": fit.limit,
-        "reference_error": fit.limit_error,
-        "longest_step_in_fit_fs": fit.longest,
+        "unit": quantity.unit, "bias_unit": _bias_unit(quantity), "reference": fit.limit,
+        "reference_error": fit.limit_error, "longest_step_in_fit_fs": fit.longest,
         "bias_limit": found.bias_limit(quantity),
         "step_of_that_bias_fs": {method: {"step": step, "seen": seen} for method, (step, seen) in steps.items()},
-    }
+    }  # fmt: skip
 
 
 def _run_to_json(found: Averages, run: AverageRun) -> dict:
@@ -160,14 +153,10 @@ def _run_to_json(found: Averages, run: AverageRun) -> dict:
             numbers = (point.mean, point.error, *bias)
             averages[quantity.name] = dict(zip(("mean", "error", "bias", "bias_error"), numbers, strict=True))
     return {
-        "integrator": run.integrator,
-        "thermostat": run.thermostat,
-        "timestep_fs": run.timestep,
-        "forces_per_ps": run.forces_per_ps,
-        "seconds_per_ns": run.seconds_per_ns,
-        "averages": averages,
+        "integrator": run.integrator, "thermostat": run.thermostat, "timestep_fs": run.timestep,
+        "forces_per_ps": run.forces_per_ps, "seconds_per_ns": run.seconds_per_ns, "averages": averages,
         "failure": run.failure or None,
-    }
+    }  # fmt: skip
 
 
 def figure_of(found: Averages):
@@ -217,11 +206,10 @@ def averages_page(found: Averages, command: str) -> str:
     rows = [[colored[method], *(step(method, q) for q in judged)] for method in methods]
     scales = dict.fromkeys(describe_scale(q) for q in judged)
     of = [f"{scale} ({', '.join(q.name for q in judged if describe_scale(q) == scale)})" for scale in scales]
-    runs = [[colored[run.method], *line[1:]] for run, line in zip(found.runs, brief_rows(found), strict=True)]
     about = f"{found.molecules} molecules, {found.freedom} degrees of freedom, {found.stage} at {found.temperature:g} K"
     note = f"{BIAS_LIMIT:.0%} is of {', '.join(of)}. Where none was seen, > gives the step up to which it is smaller"
     steps = table(["method", *(q.name for q in judged)], rows), items([note, *describe_references(found)])
-    all_runs = table(brief_headers(found), runs), items(describe_failures(found))
+    all_runs = table(*brief_table(found).shown(), marked=colored), items(describe_failures(found))
     parts = [
         f'<p class="faint">{plain(about)}; {found.sampled:g} ps at every step</p>',
         section(f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}", *steps),

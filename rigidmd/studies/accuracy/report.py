@@ -1,5 +1,6 @@
 """Report of `rigidmd accuracy`: a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
+from collections.abc import Callable
 from math import hypot
 from pathlib import Path
 from typing import NamedTuple
@@ -7,115 +8,88 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, curve_style, drawing, label_minor_ticks, open_axis, write_figure
-from rigidmd.io.write import columns_text, write_csv
+from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, open_axis, write_figure
+from rigidmd.io.table import Column, Table, with_error
 from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
-from rigidmd.view.page import chips, code, items, page, section, table, wide
+from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html", "accuracy_averages.csv")
-#: Shorter titles, so that the table fits a terminal.
-SHORT_TITLES = {"error of ": "", "energy drift in the span": "drift", " per ": "/", "seconds": "s", "spread (%)": "± %",
-                "energy rms": "energy", "orthogonality error": "QᵀQ"}  # fmt: skip
 #: Spread of repeated timings that causes a warning.
 DOUBTFUL = 0.2
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
-def trial_headers(found: IntegratorAccuracy) -> list[str]:
+def trial_table(found: IntegratorAccuracy) -> Table:
+    """A row for each trial: its cost, the errors of Q, X, and of all conserved quantities."""
     s = found.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
-    return [
-        "integrator", f"step ({s.time_unit})", f"forces per {per}", f"seconds per {per}", "spread (%)", "error of Q",
-        f"error of X ({s.length_unit})", "energy rms", "energy drift in the span", "±",
-        *(f"error of {name}" for name in _other_invariants(found)), "orthogonality error",
-    ]  # fmt: skip
+
+    def column(header: str, value: Callable[[Trial], float | None], short: str = "") -> Column:
+        def known(trial: Trial) -> float | None:
+            x = None if trial.diverged else value(trial)
+            return None if x is None or np.isnan(x) else x
+
+        return Column(header, known, short)
+
+    others = dict.fromkeys(name for trial in found.trials for name in trial.conserved_errors)
+    return Table([
+        Column("integrator", lambda t: t.integrator),
+        Column(f"step ({s.time_unit})", lambda t: t.timestep),
+        Column(f"forces per {per}", lambda t: t.forces / s.span, f"forces/{per}"),
+        Column(f"seconds per {per}", lambda t: "fails" if t.diverged else t.time / s.span, f"s/{per}"),
+        column("spread (%)", lambda t: t.spread and 100 * t.spread, "± %"),
+        column("error of Q", lambda t: t.rotation_error, "Q"),
+        column(f"error of X ({s.length_unit})", lambda t: t.position_error, f"X ({s.length_unit})"),
+        column("energy rms", lambda t: t.energy_rms, "energy"),
+        column("energy drift in the span", lambda t: t.energy_drift, "drift"),
+        column("±", lambda t: t.energy_drift_error),
+        *(column(f"error of {name}", lambda t, name=name: t.conserved_errors.get(name), name) for name in others),
+        column("orthogonality error", lambda t: t.orthogonality_error, "QᵀQ"),
+    ], found.trials)  # fmt: skip
 
 
-def _other_invariants(found: IntegratorAccuracy) -> list[str]:
-    """Conserved quantities besides the energy."""
-    return list(dict.fromkeys(name for trial in found.trials for name in trial.conserved_errors))
+def _bias(found: IntegratorAccuracy, trial: Trial, name: str) -> tuple[float, float] | None:
+    """An average less that of the trial with the smallest energy error, and the error; None for this trial itself."""
+    (value, error), (best, its_error) = trial.averages[name], found.most_exact.averages[name]
+    return None if trial is found.most_exact else (value - best, hypot(error, its_error))
 
 
-def trial_row(found: IntegratorAccuracy, trial: Trial) -> list:
-    span, kept = found.trial_system.span, _other_invariants(found)
-    if trial.diverged:
-        return [trial.integrator, trial.timestep, trial.forces / span, "fails", *[None] * (7 + len(kept))]
-    spread = None if trial.spread is None else 100 * trial.spread
-    values = [
-        trial.integrator, trial.timestep, trial.forces / span, trial.time / span, spread, trial.rotation_error,
-        trial.position_error, trial.energy_rms, trial.energy_drift, trial.energy_drift_error,
-        *(trial.conserved_errors.get(name) for name in kept), trial.orthogonality_error,
-    ]  # fmt: skip
-    return [None if isinstance(x, float) and np.isnan(x) else x for x in values]
-
-
-def average_headers(found: IntegratorAccuracy) -> list[str]:
-    titles = ["integrator", "step (fs)"]
+def averages_table(found: IntegratorAccuracy) -> Table:
+    """The averages of all trials that were sampled."""
+    columns = [Column("integrator", lambda t: t.integrator), Column("step (fs)", lambda t: t.timestep)]
     for name in ("T_trans", "T_rot", "T_rot - T_trans"):
-        for estimator in ESTIMATORS.values():
-            titles += [f"{name} {estimator} (K)", "±"]
-    return [*titles, "potential (kJ/mol)", "±", "bias", "±", "pressure (bar)", "±", "bias", "±"]
+        for kind, estimator in ESTIMATORS.items():
+            columns += with_error(f"{name} {estimator} (K)", lambda t, key=name + kind: t.averages.get(key))
+    for name, unit in (("potential", "kJ/mol"), ("pressure", "bar")):
+        columns += with_error(f"{name} ({unit})", lambda t, name=name: t.averages[name])
+        columns += with_error("bias", lambda t, name=name: _bias(found, t, name))
+    return Table(columns, [trial for trial in found.trials if trial.averages])
 
 
-def average_row(found: IntegratorAccuracy, trial: Trial) -> list:
-    """A line of the averages; biases are relative to the trial with the smallest energy error."""
-    seen, best = trial.averages, found.most_exact.averages
-    values = [trial.integrator, trial.timestep]
-    for name in ("T_trans", "T_rot", "T_rot - T_trans"):
-        for kind in ESTIMATORS:
-            values += seen.get(name + kind, (None, None))
-    for name in ("potential", "pressure"):
-        value, error = seen[name]
-        values += [value, error]
-        values += [None, None] if trial is found.most_exact else [value - best[name][0], hypot(error, best[name][1])]
-    return values
+def brief_averages_table(found: IntegratorAccuracy) -> Table:
+    """The averages that differ between steps, as text with their errors."""
+
+    def signed(measured: tuple[float, float] | None, missing: str = "-") -> str:
+        return format_signed(*measured) if measured else missing
+
+    name = "T_rot - T_trans"
+    titles = {kind: estimator if kind else f"{name} (K): {estimator}" for kind, estimator in ESTIMATORS.items()}
+    return Table([
+        Column("integrator", lambda t: t.integrator),
+        Column("step (fs)", lambda t: f"{t.timestep:.3g}"),
+        Column("T_trans (K)", lambda t: signed(t.averages["T_trans"]).lstrip("+")),
+        *(Column(title, lambda t, key=name + kind: signed(t.averages.get(key))) for kind, title in titles.items()),
+        Column("bias of U (kJ/mol)", lambda t: signed(_bias(found, t, "potential"), "(reference)")),
+        Column("bias of P (bar)", lambda t: signed(_bias(found, t, "pressure"), "(reference)")),
+    ], [trial for trial in found.trials if trial.averages])  # fmt: skip
 
 
 def table_text(found: IntegratorAccuracy) -> str:
-    titles = trial_headers(found)
-    for long, short in SHORT_TITLES.items():
-        titles = [title.replace(long, short) for title in titles]
     text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
-    text += _nonempty_columns([titles, *(trial_row(found, t) for t in found.trials)])
-    if found.sampled and (sampled := [t for t in found.trials if t.averages]):
-        rows = [brief_average_headers(), *(brief_average_row(found, t) for t in sampled)]
-        text += f"\n\naverages over {found.sampled:g} ps\n" + _nonempty_columns(rows)
+    text += trial_table(found).text()
+    if found.sampled and any(trial.averages for trial in found.trials):
+        text += f"\n\naverages over {found.sampled:g} ps\n{brief_averages_table(found).text()}"
     return text
-
-
-def brief_average_headers() -> list[str]:
-    first, *others = ESTIMATORS.values()
-    return ["integrator", "step (fs)", "T_trans (K)", f"T_rot - T_trans (K): {first}", *others, "bias of U (kJ/mol)",
-            "bias of P (bar)"]  # fmt: skip
-
-
-def brief_average_row(found: IntegratorAccuracy, trial: Trial) -> list[str | None]:
-    """The averages that differ between steps."""
-    seen, best = trial.averages, found.most_exact.averages
-    cells: list[str | None] = [trial.integrator, f"{trial.timestep:.3g}", format_signed(*seen["T_trans"]).lstrip("+")]
-    gaps = [seen.get(f"T_rot - T_trans{kind}") for kind in ESTIMATORS]
-    cells += [gap and format_signed(*gap) for gap in gaps]
-    for name in ("potential", "pressure"):
-        (value, error), (right, its_error) = seen[name], best[name]
-        cells.append(
-            "(reference)" if trial is found.most_exact else format_signed(value - right, hypot(error, its_error))
-        )
-    return cells
-
-
-def _nonempty_columns(rows: list[list]) -> str:
-    """Rows as text in columns, without the columns that have no values."""
-    lines = [[format_cell(cell) for cell in line] for line in rows]
-    kept = [k for k in range(len(lines[0])) if any(line[k] not in ("", "-") for line in lines[1:])]
-    return columns_text([[line[k] for k in kept] for line in lines])
-
-
-def format_cell(cell) -> str:
-    if cell is None:
-        return "-"
-    if isinstance(cell, str):
-        return cell
-    return f"{cell:.3g}" if 1e-3 <= abs(cell) < 1e5 or cell == 0 else f"{cell:.1e}"
 
 
 def recommendations(found: IntegratorAccuracy) -> list[str]:
@@ -249,15 +223,12 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
 
 
 def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> list[Path]:
-    write_csv(folder / FILES[0], [trial_headers(found), *(trial_row(found, trial) for trial in found.trials)])
-    written: list[str] = list(FILES[:3])
-    if sampled := [average_row(found, trial) for trial in found.trials if trial.averages]:
-        written.append(FILES[3])
-        write_csv(folder / FILES[3], [average_headers(found), *sampled])
+    trial_table(found).write(folder / FILES[0])
+    if (averages := averages_table(found)).rows:
+        averages.write(folder / FILES[3])
     write_figure(folder / FILES[1], lambda: figure_of(found), f"{found.trial_system.name}: error against run time")
-    with drawing(folder / FILES[2]) as temporary:
-        temporary.write_text(accuracy_page(found, command), encoding="utf-8")
-    return [folder / name for name in written if (folder / name).is_file()]
+    write_page(folder / FILES[2], lambda: accuracy_page(found, command))
+    return [folder / name for name in FILES if (folder / name).is_file() and (name != FILES[3] or averages.rows)]
 
 
 def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
@@ -330,15 +301,14 @@ def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
         f"for, over {found.trial_system.span:g} {per}", "the cheapest is", f"at a step of ({unit})",
         f"seconds per {per}", "times faster than velocity_verlet", "as fast within the spread of the timings",
     ]  # fmt: skip
-    trials = [[colored[t.integrator], *map(format_cell, trial_row(found, t)[1:])] for t in found.trials]
     parts = [
         section("Recommendations", table(titles, rows), items(remarks(found))),
         section("Error against run time", wide(figure_of(found), "accuracy", "log error over log run time")),
-        section("All trials", table(trial_headers(found), trials)),
+        section("All trials", table(*trial_table(found).shown(), marked=colored)),
     ]
-    if sampled := [trial for trial in found.trials if trial.averages]:
-        lines = [[colored[t.integrator], *map(format_cell, brief_average_row(found, t)[1:])] for t in sampled]
-        parts.append(section(f"Averages over {found.sampled:g} ps", table(brief_average_headers(), lines)))
+    if any(trial.averages for trial in found.trials):
+        averages = table(*brief_averages_table(found).shown(), marked=colored)
+        parts.append(section(f"Averages over {found.sampled:g} ps", averages))
     return page(
         f"{found.trial_system.name}: error against run time", [*parts, section("How to repeat it", code(command))]
     )

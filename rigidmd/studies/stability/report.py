@@ -2,23 +2,26 @@
 
 import html
 from collections import Counter
+from collections.abc import Iterable
 from math import inf, isfinite, isnan
 from pathlib import Path
 
 import numpy as np
 
 from rigidmd.core.files import write_text
-from rigidmd.figures.style import INK, curve_style, drawing, label_minor_ticks, open_axis
+from rigidmd.figures.style import INK, curve_style, label_minor_ticks, open_axis
+from rigidmd.io.table import format_cell
 from rigidmd.io.write import columns_text, write_csv
-from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult, StepLimit
-from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide
+from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
+from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide, write_page
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
 
 
-def rows(result: CaseResult) -> list[list[str]]:
-    return [_row(result, family) for family in result.families]
+def rows(results: Iterable[CaseResult]) -> list[list[str]]:
+    """A row for each case and integrator."""
+    return [_row(result, family) for result in results for family in result.families]
 
 
 def _row(result: CaseResult, family: str) -> list[str]:
@@ -31,26 +34,19 @@ def _row(result: CaseResult, family: str) -> list[str]:
     # the least of its limits if there are several settings
     least = min(limits, key=lambda limit: limit.longest, default=None)
     seconds = sum(t.outcome.seconds for t in runs) + sum(limit.seconds for limit in limits)
+    longest = "-"
+    if least:
+        limit = least.longest if least.longest < inf else max(step for step, _ in least.curve)
+        longest = f"{'' if least.longest < inf else '> '}{format_cell(limit)} {result.step_unit}"
     return [
         result.name, family or "-", str(len(runs)), ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v]),
-        _short(worst.outcome.error) if worst else "-", _short(worst.allowed) if worst else "-",
-        _describe_limit(least, result.step_unit) if least else "-", (least.beyond or "-") if least else "-",
-        f"{seconds:.1f}",
+        format_cell(worst.outcome.error) if worst else "-", format_cell(worst.allowed) if worst else "-",
+        longest, (least.beyond or "-") if least else "-", f"{seconds:.1f}",
     ]  # fmt: skip
 
 
-def _describe_limit(limit: StepLimit, unit: str) -> str:
-    if limit.longest == inf:
-        return f"> {_short(max(step for step, _ in limit.curve))} {unit}"
-    return f"{_short(limit.longest)} {unit}"
-
-
-def _short(x: float) -> str:
-    return f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
-
-
 def table_text(results: list[CaseResult]) -> str:
-    return columns_text([HEADERS, *(line for result in results for line in rows(result))], left=(0, 1, 3, 7))
+    return columns_text([HEADERS, *rows(results)], left=(0, 1, 3, 7))
 
 
 def conclusions(results: list[CaseResult]) -> list[str]:
@@ -79,8 +75,7 @@ def write_stability(folder: Path, results: list[CaseResult], command: str, machi
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
     write_csv(folder / FILES[0], [titles, *(line for result in results for line in _csv_lines(result))])
     write_text(folder / FILES[2], markdown(results, command, machine))
-    with drawing(folder / FILES[1]) as temporary:
-        temporary.write_text(stability_page(results, command, machine), encoding="utf-8")
+    write_page(folder / FILES[1], lambda: stability_page(results, command, machine))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
 
@@ -102,7 +97,7 @@ def markdown(results: list[CaseResult], command: str, machine: str) -> str:
     lines += [f"- *{verdict}*: {meaning}" for verdict, meaning in VERDICTS.items()]
     bound = f"- *longest step*: at which conserved quantities stay within {BOUND:g} of the kinetic energy, bisected"
     lines += [bound, "", "| " + " | ".join(HEADERS) + " |", "|" + "---|" * len(HEADERS)]
-    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for f in results for line in rows(f)]
+    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for line in rows(results)]
     lines += ["", "## Cases", ""]
     for f in results:
         lines.append(f"- **{f.name}** ({f.group}): {f.sentence}.")
@@ -186,14 +181,14 @@ MESSAGES = 3
 
 def stability_page(results: list[CaseResult], command: str, machine: str) -> str:
     styles = styles_of(results)
-    glance = [[_link(f), *_counts(f), f.sentence] for f in results]
+    links = {f.name: _link(f) for f in results}
+    glance = [[links[f.name], *_counts(f), f.sentence] for f in results]
     meanings = [[Raw(_badge(verdict)), meaning] for verdict, meaning in VERDICTS.items()]
     bound = f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic energy."
-    lines = [[_link(f), *line[1:]] for f in results for line in rows(f)]
     parts = [
         items(conclusions(results)),
         section("At a glance", table(["case", *VERDICTS, ""], glance), table([], meanings, words=True)),
-        section("All integrators", table(HEADERS, lines), f"<p>{html.escape(bound)}</p>"),
+        section("All integrators", table(HEADERS, rows(results), marked=links), f"<p>{html.escape(bound)}</p>"),
         *(_case(result, styles) for result in results),
         section("How to repeat it", code(f"{command}    # on {machine}")),
     ]

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -95,16 +95,16 @@ class Backend:
 
     def __init__(self, executor: Executor, capacity: Callable[[], int], run: Callable[[PointTask], PointResult]):
         self._executor, self._capacity, self._run = executor, capacity, run
-        self._running: dict[str, Future] = {}
+        self.running: dict[str, Future] = {}
         self._messages: queue.SimpleQueue[tuple[str, str, Any]] = queue.SimpleQueue()
 
     @property
     def free(self) -> int:
         """Number of points that it would accept now."""
-        return self._capacity() - len(self._running)
+        return self._capacity() - len(self.running)
 
     def submit(self, task: PointTask) -> None:
-        future = self._running[task["name"]] = self._executor.submit(self._run, task)
+        future = self.running[task["name"]] = self._executor.submit(self._run, task)
         future.add_done_callback(partial(self._end, task["name"]))
 
     def _end(self, name: str, future: Future) -> None:
@@ -115,17 +115,16 @@ class Backend:
         except (Exception, CancelledError) as error:  # of the executor
             self._messages.put((name, "died", f"it failed to run: {type(error).__name__}: {error}"))
 
-    def messages(self, seconds: float) -> list[tuple[str, str, Any]]:
+    def messages(self, seconds: float) -> Iterator[tuple[str, str, Any]]:
         """(point, kind, value) of messages that come within this time: those of `run_task`, ended, or died with why."""
-        found = []
         with contextlib.suppress(queue.Empty):
-            found.append(self._messages.get(timeout=seconds))
             while True:
-                found.append(self._messages.get_nowait())
-        for name, kind, _ in found:
-            if kind in ("ended", "died"):
-                self._running.pop(name, None)
-        return found
+                name, kind, value = self._messages.get(timeout=seconds)
+                seconds = 0.0
+                if name in self.running:  # a cluster may deliver late
+                    if kind in ("ended", "died"):
+                        del self.running[name]
+                    yield name, kind, value
 
 
 class Pool(Backend):
@@ -207,7 +206,7 @@ class Cluster(Backend):
 
     def kill(self) -> None:
         self.stop()
-        for name in list(self._running):
+        for name in list(self.running):
             self._messages.put((name, "died", "it was abandoned"))
 
     def close(self) -> None:
@@ -215,7 +214,7 @@ class Cluster(Backend):
         self._client.close()
         if self._local_cluster is not None:
             self._local_cluster.close()
-        if not self._running:
+        if not self.running:
             self._stop.unlink(missing_ok=True)
 
 

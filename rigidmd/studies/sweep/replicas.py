@@ -12,8 +12,10 @@ from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
-from rigidmd.io.write import nine_digits, write_csv, writing
+from rigidmd.io.table import Column, Table, with_error
+from rigidmd.io.write import nine_digits, writing
 from rigidmd.studies.sweep.folder import FINISHED, Manifest, SweepPoint, read_manifest, state_on_disk
+from rigidmd.studies.sweep.table import key_columns
 
 ANALYSES = "analysis.csv"
 
@@ -71,7 +73,7 @@ def analyse_sweep(
         raise OutputError(f"{folder}: no point can be analysed: {next(iter(failed.values()))}")
     found = [_combine(folder, manifest, values, points, done, failed) for values, points in manifest.combinations()]
     found = [combination for combination in found if combination.runs]
-    _write_table(folder, manifest, found)
+    _write_table(folder, found)
     return found
 
 
@@ -172,27 +174,21 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
     return Curve(first.file, (header, kept), first.label, columns, errors, first.log, first.level, first.bars)
 
 
-def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
+def _write_table(folder: Path, found: list[Combination]) -> None:
     """analysis.csv: a line for each combination, its values with their errors."""
-    results = [result for combination in found for result in combination.results]
-    titles = dict.fromkeys((result.name, value.name, value.unit) for result in results for value in result.values)
-    keys = list(found[0].values)
-    head: list[Any] = [*keys, "runs"]
-    for _, name, unit in titles:
+    values = {
+        combination.title: {(result.name, v.name, v.unit): v for result in combination.results for v in result.values}
+        for combination in found
+    }
+    columns = [*key_columns(found[0].values), Column("runs", lambda combination: combination.runs)]
+    for title in dict.fromkeys(title for of_combination in values.values() for title in of_combination):
+
+        def measured(combination: Combination, title: tuple = title) -> list[float | None] | None:
+            value = values[combination.title].get(title)
+            return value and [nine_digits(value.value), nine_digits(value.error)]
+
+        _, name, unit = title
         header = f"{name} ({unit})" if unit not in ("", "1") else name
-        head += [header, f"{header} error"]
-    lines = [head]
-    for combination in found:
-        both = [(result, value) for result in combination.results for value in result.values]
-        values_by_title = {(result.name, value.name, value.unit): value for result, value in both}
-        line: list[Any] = [_cell(combination.values[key]) for key in keys] + [combination.runs]
-        for title in titles:
-            value = values_by_title.get(title)
-            line += [None, None] if value is None else [nine_digits(value.value), nine_digits(value.error)]
-        lines.append(line)
+        columns += with_error(header, measured, f"{header} error")
     add_to_folder(folder, [ANALYSES])
-    write_csv(folder / ANALYSES, lines, csv.QUOTE_NONNUMERIC)
-
-
-def _cell(value: Any) -> Any:
-    return value if isinstance(value, int | float | str) and not isinstance(value, bool) else str(value)
+    Table(columns, found).write(folder / ANALYSES, csv.QUOTE_NONNUMERIC)

@@ -54,7 +54,6 @@ def run_points(
     found.skipped = [point.folder for point in manifest.points if point.state == FINISHED]
     waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
     changed, written = True, 0.0
-    busy: set[str] = set()
     ends_at, least = None, 0.0
     if walltime is not None:
         ends_at = clock.time() + checked_walltime(walltime) - min(SPARE, SPARE_FRACTION * walltime)
@@ -70,15 +69,12 @@ def run_points(
         while True:
             late = ends_at is not None and clock.time() + least > ends_at
             while found.signal is None and not late and runner.free and (point := waiting.next()):
-                busy.add(point.folder)
                 runner.submit(task_of(folder, manifest, point, ends_at, trust))
-            if not busy:
+            if not runner.running:
                 break
             if found.signal is not None:
                 runner.kill() if pressed > 1 else runner.stop()
             for name, kind, value in runner.messages(TICK):
-                if name not in busy:  # a cluster may deliver late
-                    continue
                 if kind != "died" or found.signal is None:  # else it was stopped before its first step
                     receive(name, kind, value)
                 if kind not in ("begun", "ended", "died"):
@@ -88,7 +84,6 @@ def run_points(
                 if kind == "begun":
                     point.state, point.message = RUNNING, None
                     continue
-                busy.discard(name)
                 if kind == "ended":
                     point.state, point.message, point.ran_sha256 = value["state"], value["message"], value["sha256"]
                     point.seconds += value["seconds"]

@@ -14,7 +14,6 @@ from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock
-from rigidmd.io.write import write_csv
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.axes import Axis, axes_of, check_axes
@@ -27,7 +26,6 @@ from rigidmd.studies.sweep.folder import (
     TABLE,
     Manifest,
     check_sweep_folder,
-    is_sweep,
     make_sweep_folder,
     read_manifest,
     write_manifest,
@@ -63,15 +61,6 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class SweepRequest(NamedTuple):
-    path: Path  # of the scene file
-    axes: list[Axis]
-    folder: Path | None = None  # default: runs/NAME-sweep
-    replicas: int | None = None  # number of seeds, from the seed of the scene on
-    trust: Sequence[str] = ()  # Python files that the scene may run
-    force: bool = False  # remove the sweep in the folder
-
-
 class OpenSweep(NamedTuple):
     """A sweep with its folder, in which no other sweep runs."""
 
@@ -85,29 +74,36 @@ class OpenSweep(NamedTuple):
         return sum(point.state != FINISHED for point in self.manifest.points)
 
 
-def open_sweep(request: SweepRequest, stack: ExitStack) -> OpenSweep:
-    """Check all points, compare them with the folder, and write the manifest.
+def open_sweep(
+    stack: ExitStack, scene: Path, axes: list[Axis], folder: Path | None = None, replicas: int | None = None,
+    trust: Sequence[str] = (), force: bool = False,
+) -> OpenSweep:  # fmt: skip
+    """Check all points of a scene file, compare them with the folder, and write the manifest.
 
-    No other sweep can run in the folder until the stack ends. Raises SceneError, OutputError.
+    folder : default: runs/NAME-sweep; no other sweep can run in it until the stack ends
+    replicas : number of seeds, from the seed of the scene on
+    trust : Python files that the scene may run; force : remove the sweep in the folder
+
+    Raises SceneError, OutputError.
     """
-    from rigidmd.assemble.user_code.trust import trust
+    from rigidmd.assemble.user_code.trust import trust as trust_file
 
-    for path in request.trust:
-        trust(path)
-    data, _ = read_tables(request.path)
-    axes = request.axes if request.replicas is None else _with_seeds(request, data)
+    for path in trust:
+        trust_file(path)
+    data, _ = read_tables(scene)
+    axes = axes if replicas is None else _with_seeds(scene, axes, replicas, data)
     keys = [key for axis in axes for key in axis.keys]
-    if request.trust and not any("module" in str(part) for part in (data.get("forces"), keys)):
-        raise SceneError("--trust", [f"{request.path} names no Python file by module in [[forces.custom]]"])
+    if trust and not any("module" in str(part) for part in (data.get("forces"), keys)):
+        raise SceneError("--trust", [f"{scene} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
-    folder = request.folder or Path("runs") / f"{named or default_name(request.path)}-sweep"
+    folder = folder or Path("runs") / f"{named or default_name(scene)}-sweep"
     check_sweep_folder(folder)
-    axes = check_axes(axes if request.force else order_axes(folder, axes))
-    fresh, is_body = read_points(request.path, axes)
+    axes = check_axes(axes if force else order_axes(folder, axes))
+    fresh, is_body = read_points(scene, axes)
     lock = FolderLock(folder)
     stack.callback(lock.release)
     lock.take()
-    manifest = merge_manifests(folder, fresh, request.force)
+    manifest = merge_manifests(folder, fresh, force)
     make_sweep_folder(folder)
     lock.take()
     write_manifest(folder, manifest)
@@ -116,8 +112,7 @@ def open_sweep(request: SweepRequest, stack: ExitStack) -> OpenSweep:
 
 def open_existing_sweep(folder: Path, stack: ExitStack) -> OpenSweep:
     """An existing sweep; the states of its points are read from their folders. Raises OutputError."""
-    if not is_sweep(folder):
-        raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
+    read_manifest(folder)  # before anything is written
     lock = FolderLock(folder)
     stack.callback(lock.release)
     lock.take()
@@ -128,18 +123,17 @@ def open_existing_sweep(folder: Path, stack: ExitStack) -> OpenSweep:
     return OpenSweep(folder, manifest, False)
 
 
-def _with_seeds(request: SweepRequest, data: Mapping[str, Any]) -> list[Axis]:
+def _with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, Any]) -> list[Axis]:
     """The axes with an axis of the seeds of replicas."""
     if "body" in data:
-        raise SceneError("--replicas", [f"{request.path} is a single body, whose motion has no seed"])
-    with_seed = [axis for axis in request.axes if SEED in axis.keys]
+        raise SceneError("--replicas", [f"{scene} is a single body, whose motion has no seed"])
+    with_seed = [axis for axis in axes if SEED in axis.keys]
     if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
         raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
     seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
-        raise SceneError(str(request.path), [f"seed is {shorten_repr(seed)}, must be a whole number"])
-    seeds = Axis((SEED,), tuple(range(seed, seed + (request.replicas or 1))))
-    return [*(axis for axis in request.axes if axis not in with_seed), seeds]
+        raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be a whole number"])
+    return [*(axis for axis in axes if axis not in with_seed), Axis((SEED,), tuple(range(seed, seed + replicas)))]
 
 
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
@@ -168,11 +162,9 @@ def sweep(
     Raises SceneError and OutputError before anything runs, SimulationError if points failed (`sweep.json` has
     the reasons), KeyboardInterrupt after Ctrl-C. The same call continues a sweep.
     """
-    request = SweepRequest(
-        Path(scene), axes_of(sets), None if folder is None else Path(folder), trust=trust, force=force
-    )
     with ExitStack() as stack:
-        there = open_sweep(request, stack)
+        where = None if folder is None else Path(folder)
+        there = open_sweep(stack, Path(scene), axes_of(sets), where, trust=trust, force=force)
         manifest = there.manifest
         pool = Pool(*jobs_and_threads(there.left, jobs, threads, there.is_body))
         outcome = run_points(there.folder, manifest, pool, trust=trust)
@@ -192,7 +184,7 @@ def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     table = table_of(folder, manifest)
     if not any(row.runs for row in table.rows):
         return table, []
-    write_csv(folder / TABLE, table.lines(), csv.QUOTE_NONNUMERIC)
+    table.as_columns().write(folder / TABLE, csv.QUOTE_NONNUMERIC)
     files = [folder / TABLE, draw_sweep(table, manifest.name)]
     return table, [path for path in files if path is not None and path.is_file()]
 

@@ -1,5 +1,6 @@
 """The table of a sweep: a line for each combination of values, with means and errors over its replicas."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
@@ -11,7 +12,9 @@ from rigidmd.analysis.source import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
 from rigidmd.errors import RigidMDError
-from rigidmd.io.write import columns_text, nine_digits
+from rigidmd.io.table import Column, with_error
+from rigidmd.io.table import Table as ReportTable
+from rigidmd.io.write import nine_digits
 from rigidmd.run.record import Record, read_record
 from rigidmd.studies.sweep.folder import FINISHED, Manifest, short_keys, value_name
 
@@ -94,31 +97,30 @@ class Table:
             import pandas
         except ImportError:
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
-        head, *lines = self.lines()
-        return pandas.DataFrame(lines, columns=head)
+        table = self.as_columns()
+        rows = list(map(table.values, table.rows))
+        return pandas.DataFrame(rows, columns=[column.header for column in table.columns])
 
-    def lines(self) -> list[list[Any]]:
-        """Header and rows: values of keys, number of runs, and for each column its mean and its error."""
-        bare = [column for column in self.columns if all(row[column][1] is None for row in self.rows)]
-        head: list[Any] = [*self.keys, "runs"]
-        for column in self.columns:
-            head += [column] if column in bare else [column, f"{column} error"]
-        found = [head]
-        for row in self.rows:
-            line = [_cell(row.values[key]) for key in self.keys] + [len(row.runs)]
-            for column in self.columns:
-                value, error = row[column]
-                line += [nine_digits(value)] if column in bare else [nine_digits(value), nine_digits(error)]
-            found.append(line)
-        return found
+    def as_columns(self) -> ReportTable:
+        """Values of keys, number of runs, and each column with its error: the table of sweep.csv."""
+        columns = [*key_columns(self.keys), Column("runs", lambda row: len(row.runs))]
+        for name in self.columns:
+            pair = with_error(name, lambda row, name=name: list(map(nine_digits, row[name])), f"{name} error")
+            columns += pair if any(row[name][1] is not None for row in self.rows) else pair[:1]
+        return ReportTable(columns, self.rows)
 
     def _check(self, column: str) -> None:
         if column not in self.columns:
             raise KeyError(f"no column {column!r}; there are {', '.join([*self.keys, *self.columns])}")
 
 
-def _cell(value: Any) -> Any:
-    return value if isinstance(value, int | float | str) and not isinstance(value, bool) else value_name(value)
+def key_columns(keys: Iterable[str]) -> list[Column]:
+    """The columns of the values of the keys of a combination."""
+
+    def cell(value: Any) -> Any:
+        return value if type(value) in (int, float, str) else value_name(value)
+
+    return [Column(key, lambda row, key=key: cell(row.values[key])) for key in keys]
 
 
 def table_of(folder: Path, manifest: Manifest) -> Table:
@@ -183,12 +185,11 @@ def _summarise_motion(record: Record) -> dict[str, Measured]:
 
 
 def table_text(table: Table) -> str:
-    short = short_keys(table.keys)
-    shown = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
-    lines = [[*short.values(), "runs", *(SHORT.get(column, column) for column in shown)]]
-    for row in table.rows:
-        cells = [value_name(row.values[key]) for key in table.keys] + [str(len(row.runs))]
-        means = [row[column] for column in shown]
-        cells += ["-" if not np.isfinite(value) else format_with_error(value, error) for value, error in means]
-        lines.append(cells)
-    return columns_text(lines, left=())
+    def text(value: float, error: float | None) -> str:
+        return format_with_error(value, error) if np.isfinite(value) else "-"
+
+    short, shown = short_keys(table.keys), [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns]
+    keys = [Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys]
+    means = [Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown]
+    runs = Column("runs", lambda row: str(len(row.runs)))
+    return ReportTable([*keys, runs, *means], table.rows).text(left=())
