@@ -215,8 +215,8 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
     "studies.sweep.sweeping": "format_ranges format_walltime write_slurm_script",
-    "view.animation": "_loop_end write_film",
-    "view.body_animation": "animate_body",
+    "view.animation": "write_film",
+    "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS find_example notebooks",
     "analysis.result": "Curve AnalysisResult Value converged_value",
     "analysis.rigid_frames": "fit_frames",

@@ -265,17 +265,17 @@ def test_a_film_as_mp4(top, tmp_path):
 
 
 def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
-    from support import _loop_end, animate_body
+    from support import BodyAnimation
 
-    record = read_record(top)
-    film = animate_body(record)
+    film = BodyAnimation(read_record(top))
+    assert film.loop_end() == (0.5, [])  # this top has fallen and risen, but turned elsewhere
     half = np.pi * film.time / 0.13  # half the angle of a turn in 0.13 s, about z
     turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
-    end, told = _loop_end(film._replace(quaternion=turning, vectors=still))
+    film.quaternion, film.vectors = turning, still
+    end, told = film.loop_end()
     assert end == pytest.approx(0.39, abs=1e-9)
     assert "returns to its start at 0.39 s" in told[0]
-    assert _loop_end(film) == (0.5, [])  # this top has fallen and risen, but turned elsewhere
 
 
 @pytest.mark.parametrize("command", ["report", "view", "film"])

@@ -1,12 +1,11 @@
 """`rigidmd accuracy`: errors of integrators against their run time; with --averages alone, the bias of averages."""
 
 import argparse
-from collections.abc import Callable
 from math import inf
 from pathlib import Path
 
 from rigidmd.commands.arguments import add_output_folder, add_scene, command, command_line, read_scene
-from rigidmd.commands.streams import announce, progress_bar
+from rigidmd.commands.streams import progress_bar
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,8 +63,7 @@ def _accuracy(options: argparse.Namespace) -> int:
         return _averages(options, scene, folder, integrators, timesteps)
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages without a PS"])
-    with progress_bar() as bar:
-        progress = _progress(bar, "compiling and running the reference")
+    with progress_bar("compiling and running the reference") as progress:
         found = measure_accuracy(
             scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
         )
@@ -85,23 +83,10 @@ def _averages(
 
     check_folder(folder, options.force, names=FILES)
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-    with progress_bar() as bar:
-        progress = _progress(bar, "compiling, and running what comes before the last stage")
+    with progress_bar("compiling, and running what comes before the last stage") as progress:
         found = measure_averages(scene, methods, timesteps, sample, progress)
     print(table_text(found), "", *bias_conclusions(found), sep="\n")
     make_folder(folder, options.force, FILES)
     written = write_averages(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
-
-
-def _progress(bar, begins: str) -> Callable[[float], None]:
-    """A callback that moves a bar; at 0, when all arguments have been checked, it announces what begins."""
-
-    def progress(fraction: float) -> None:
-        if fraction == 0:
-            bar.clear()
-            announce(begins)
-        bar.update(fraction - bar.n)
-
-    return progress

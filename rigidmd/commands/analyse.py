@@ -54,12 +54,7 @@ def _analyse(options: argparse.Namespace) -> int:
 
     for path in options.trust:
         run_user_file(Path(path))
-    with progress_bar("{desc} {l_bar}{bar}| [{elapsed}<{remaining}]") as bar:
-
-        def progress(fraction: float, name: str) -> None:
-            bar.set_description_str(name, refresh=False)
-            bar.update(fraction - bar.n)
-
+    with progress_bar() as progress:
         request = AnalysisRequest(options.only, options.start, options.viscosity)
         if is_sweep(Path(options.folder)):
             return _analyse_sweep(Path(options.folder), request, progress)

@@ -22,8 +22,7 @@ def _film(options: argparse.Namespace) -> int:
 
     path = file_about_run(options, default_name(), EXTENSIONS)
     check_writer(path)
-    with progress_bar() as bar:
-        progress = lambda fraction: bar.update(fraction - bar.n)  # noqa: E731
+    with progress_bar() as progress:
         path, notes = write_film(
             Path(options.folder), path, options.seconds, options.plots, options.height, progress
         )  # fmt: skip

@@ -25,15 +25,12 @@ def _stability(options: argparse.Namespace) -> int:
 
     from rigidmd.io.folder import check_folder, make_folder
     from rigidmd.studies.stability.report import FILES, conclusions, has_failed, table_text, write_stability
-    from rigidmd.studies.stability.stability import run_cases, selected_cases
+    from rigidmd.studies.stability.stability import run_cases
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     check_folder(folder, options.force, names=FILES)
-    with progress_bar("{l_bar}{bar}| {desc} [{elapsed}]", len(selected_cases(options.case))) as bar:
-        results = []
-        for result in run_cases(options.case, options.quick, bar.set_description_str):
-            results.append(result)
-            bar.update()
+    with progress_bar() as progress:
+        results = list(run_cases(options.case, options.quick, progress))
     print(table_text(results), "", *conclusions(results), sep="\n")
     make_folder(folder, options.force, FILES)
     machine = platform.processor() or platform.machine()

@@ -4,13 +4,10 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO
 
 from rigidmd.errors import OutputError, visible
-
-if TYPE_CHECKING:
-    from tqdm import tqdm
 
 
 def announce(message: str) -> None:
@@ -21,11 +18,25 @@ def warn(message: str) -> None:
     print(f"rigidmd: warning: {visible(message)}", file=sys.stderr)
 
 
-def progress_bar(form: str = "{l_bar}{bar}| [{elapsed}<{remaining}]", total: float = 1.0) -> "tqdm":
-    """A bar on a terminal, which disappears at its end."""
+@contextlib.contextmanager
+def progress_bar(begins: str = "") -> Iterator[Callable]:
+    """A bar on a terminal, which disappears at its end: a function of the fraction that is done and a description.
+
+    begins : what begins at the fraction 0, when all arguments have been checked
+    """
     from tqdm import tqdm
 
-    return tqdm(total=total, disable=None, leave=False, bar_format=form)
+    form = "{l_bar}{bar}| [{elapsed}<{remaining}]"  # the left part has the description
+    with tqdm(total=1.0, disable=None, leave=False, bar_format=form) as bar:
+
+        def progress(fraction: float, description: str = "") -> None:
+            if begins and fraction == 0:
+                bar.clear()
+                announce(begins)
+            bar.set_description_str(description, refresh=False)
+            bar.update(fraction - bar.n)
+
+        yield progress
 
 
 def open_streams() -> None:

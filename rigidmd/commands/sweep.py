@@ -14,9 +14,7 @@ from rigidmd.errors import visible
 
 if TYPE_CHECKING:
     from rigidmd.io.progress import Bar
-    from rigidmd.studies.sweep.folder import Manifest
     from rigidmd.studies.sweep.sweeping import OpenSweep
-    from rigidmd.studies.sweep.table import Table
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,21 +68,18 @@ def _sweep(options: argparse.Namespace) -> int:
 
     _check(options)
     folder = Path(options.output) if options.output else None
+    if options.point is not None:
+        return _run_point(options)
     with ExitStack() as stack:
-        if options.point is not None:
-            return _run_point(options)
         if options.collect and not options.sets and options.replicas is None:
             if folder is None:
                 raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
             return _collect(open_existing_sweep(folder, stack))
-        axes = parse_axes(options.sets)
-        scene, force = Path(options.scene), options.force
-        sweep = open_sweep(stack, scene, axes, folder, options.replicas, options.trust, force)
-        if options.collect:
+        scene, axes = Path(options.scene), parse_axes(options.sets)
+        sweep = open_sweep(stack, scene, axes, folder, options.replicas, options.trust, options.force)
+        if options.collect or (options.to is not None and not sweep.left):
             return _collect(sweep)
-        if options.to is not None:
-            return _write_slurm_script(options, sweep)
-        return _run(options, sweep)
+        return _run(options, sweep) if options.to is None else _write_slurm_script(options, sweep)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -108,7 +103,7 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     from rigidmd.io.progress import progress_of
     from rigidmd.studies.sweep.backends import Cluster, Pool
     from rigidmd.studies.sweep.running import SweepOutcome, run_points
-    from rigidmd.studies.sweep.sweeping import collect, jobs_and_threads
+    from rigidmd.studies.sweep.sweeping import jobs_and_threads
 
     folder, manifest = sweep.folder, sweep.manifest
     jobs, threads = jobs_and_threads(sweep.left, options.jobs, options.threads, sweep.is_body)
@@ -128,7 +123,7 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
             outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).receive)
     else:
         outcome = SweepOutcome(skipped=[point.folder for point in manifest.points])
-    _print_results(*collect(folder, manifest), manifest)
+    _print_results(sweep)
     print(
         f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {len(outcome.skipped)} skipped, "
         f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
@@ -177,35 +172,33 @@ class _Listener:
             tqdm.write(f"rigidmd: warning: {name}: {visible(value)}", file=sys.stderr)
 
 
-def _print_results(table: "Table", files: list[Path], manifest: "Manifest") -> None:
+def _print_results(sweep: "OpenSweep") -> None:
+    """Write and print the table of what has finished."""
+    from rigidmd.studies.sweep.sweeping import collect
     from rigidmd.studies.sweep.table import table_text
 
+    table, files = collect(sweep.folder, sweep.manifest)
     if files:
         print(table_text(table))
     for name, why in table.failed.items():
         print(f"  {name} is not in the table: {why}")
     names = ["sweep.json", *(path.name for path in files)]
-    print(f"\n  files in {table.folder}: {', '.join(names)}, and a folder for each of {len(manifest.points)} points")
+    count = len(sweep.manifest.points)
+    print(f"\n  files in {sweep.folder}: {', '.join(names)}, and a folder for each of {count} points")
     if any(row.runs for row in table.rows):
-        print(f"  `rigidmd analyse {shlex.quote(str(table.folder))}` measures all of them")
+        print(f"  `rigidmd analyse {shlex.quote(str(sweep.folder))}` measures all of them")
 
 
 def _collect(sweep: "OpenSweep") -> int:
-    from rigidmd.studies.sweep.sweeping import collect
-
     count = len(sweep.manifest.points)
-    left = sum(point.state != "finished" for point in sweep.manifest.points)
-    print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - left} of them finished")
-    _print_results(*collect(sweep.folder, sweep.manifest), sweep.manifest)
-    return FAILED if left else 0
+    print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - sweep.left} of them finished")
+    _print_results(sweep)
+    return FAILED if sweep.left else 0
 
 
 def _write_slurm_script(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     from rigidmd.studies.sweep.sweeping import write_slurm_script
 
-    if not sweep.left:
-        print(f"all {len(sweep.manifest.points)} points in {sweep.folder} have finished")
-        return _collect(sweep)
     path, count = write_slurm_script(
         sweep.folder, sweep.manifest, options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
     )

@@ -6,7 +6,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.files import atomic_file
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, camera, circle, save_figure, settings, thin_series
+from rigidmd.figures.style import (
+    COOL,
+    FAINT,
+    INK,
+    UP,
+    WARM,
+    camera,
+    circle,
+    draw_front_and_back,
+    globe,
+    save_figure,
+    settings,
+    thin_series,
+)
 
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
@@ -16,7 +29,6 @@ NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
-UP = np.array([0.0, 0.0, 1.0])
 #: Lines with more points are rasterised in the SVG; level at which an error of exactly 0 is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
@@ -82,11 +94,10 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     sphere, disc = (figure := _new_figure("path of the body axis", 10, 5.4)).subplots(1, 2)
     view, half = camera(eye, UP), np.full(2, 1.12)
     _shade(sphere, [(np.ones(3), FAINT)], view, half, np.zeros(2))
-    grid = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
-    for ring in [*grid, *(circle(UP, theta) for theta in range(30, 180, 30))]:
-        _front_and_back(sphere, ring, view, ring @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
+    for ring in globe():
+        draw_front_and_back(sphere, ring, view, ring @ eye, (0.45, 0.12), color=FAINT, lw=0.4)
     for ring in (extremes := [circle(UP, polar.min()), circle(UP, polar.max())]):
-        _front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
+        draw_front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
     _draw_path(sphere, path, view, path @ eye, half, np.zeros(2), COOL)
     _triad(sphere, view, "xyz", down)
     sphere.set_title(f"from 25° {word} the horizon", **NOTE)
@@ -317,21 +328,11 @@ def _draw_path(axis, points: np.ndarray, view: np.ndarray, depth: np.ndarray, ha
     """Draw a path in space with a dot at its start; longer paths are thinner."""
     flat = points @ view[:2].T
     shown, style = _path_style(flat, half.max())
-    _front_and_back(axis, points[shown], view, depth[shown], (0.95, 0.25), color=color, **style)
+    draw_front_and_back(axis, points[shown], view, depth[shown], (0.95, 0.25), color=color, **style)
     axis.plot(*flat[0], "o", color=WARM, ms=5, alpha=1.0 if depth[0] >= 0 else 0.5, zorder=4)
     axis.axis(np.stack([centre - half, centre + half], axis=1).ravel())
     axis.set_aspect("equal")
     axis.set_axis_off()
-
-
-def _front_and_back(axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style) -> None:
-    """A line that is strong on the side of the eye and faint on the other."""
-    flat, front = points @ view[:2].T, depth >= 0
-    joined = front.copy()
-    joined[:-1] |= front[1:]
-    joined[1:] |= front[:-1]
-    for part, alpha, order in ((joined, alphas[0], 3), (~front, alphas[1], 1.5)):
-        axis.plot(*np.where(part[:, None], flat, np.nan).T, alpha=alpha, zorder=order, **style)
 
 
 def _triad(axis, view: np.ndarray, names, down: np.ndarray | None = None) -> None:

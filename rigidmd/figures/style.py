@@ -18,6 +18,7 @@ AT_ONCE = 5000
 INK, FAINT, WARM, COOL = "#1f2430", "#8a8f99", "#c8553d", "#2b6f9e"
 COLORS = ("#2b6f9e", "#c8553d", "#4f8a5b", "#7a5ca3", "#b8862d", "#1f2430", "#3fa7a0", "#c2569a", "#8a8f99", "#7f9a1c")
 MARKERS = "os^Dv*PX<>"
+UP = np.array([0.0, 0.0, 1.0])
 DASHES = ((), (5, 1.5), (1.5, 1.2), (6, 1.5, 1.5, 1.5))
 
 
@@ -141,6 +142,29 @@ def circle(normal: np.ndarray, polar: float = 90.0) -> np.ndarray:
     right, up, toward = camera(normal, np.eye(3)[np.abs(normal).argmin()])
     angle, polar = np.linspace(0, 2 * np.pi, 361)[:, None], np.radians(polar)
     return np.sin(polar) * (np.cos(angle) * right + np.sin(angle) * up) + np.cos(polar) * toward
+
+
+def globe() -> list[np.ndarray]:
+    """Circles of longitude and latitude on the unit sphere, every 30 degrees."""
+    around = [circle(np.array([np.cos(a), np.sin(a), 0.0])) for a in np.radians(np.arange(0, 180, 30))]
+    return [*around, *(circle(UP, polar) for polar in range(30, 180, 30))]
+
+
+def draw_front_and_back(axis, points, view: np.ndarray, depth, alphas: tuple[float, float], **style) -> None:
+    """Draw a line that is strong on the side of the eye (depth >= 0) and faint on the other."""
+    flat, front = points @ view[:2].T, depth >= 0
+    joined = front.copy()
+    joined[:-1] |= front[1:]
+    joined[1:] |= front[:-1]
+    for part, alpha, order in ((joined, alphas[0], 3), (~front, alphas[1], 1.5)):
+        axis.plot(*np.where(part[:, None], flat, np.nan).T, alpha=alpha, zorder=order, **style)
+
+
+def draw_scale(axis, right: float, foot: float, length: float, label: str, fontsize: float = 10) -> None:
+    """Draw a bar of this length with its label above it, from its right end at (right, foot)."""
+    axis.plot([right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4)
+    style = {"ha": "right", "va": "bottom", "zorder": 4, "textcoords": "offset points"}
+    axis.annotate(label, (right, foot), (0, 3), color=INK, fontsize=fontsize, **style)
 
 
 def label_minor_ticks(line) -> None:

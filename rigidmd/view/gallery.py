@@ -16,7 +16,7 @@ from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene import Scene
 from rigidmd.view.animation_page import write_view
-from rigidmd.view.body_animation import BodyDrawing, animate_body
+from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.page import code, page
 
 INDEX = "index.html"
@@ -69,10 +69,9 @@ def write_gallery(
 def _picture(record: Record) -> str:
     from rigidmd.figures.picture import Picture
 
-    animation = animate_body(record)
+    animation = BodyAnimation(record)
     figure = Picture(figsize=(INCHES, INCHES), dpi=DPI)
-    time = float(np.interp(RUN_FRACTION, [0, 1], animation.time[[0, -1]]))
-    BodyDrawing(animation, not record.body.translates).draw(figure.add_axes((0, 0, 1, 1)), time)
+    animation.draw(figure.add_axes((0, 0, 1, 1)), float(np.interp(RUN_FRACTION, [0, 1], animation.time[[0, -1]])))
     stream = io.BytesIO()
     save_figure(figure, stream, format="png", dpi=DPI)
     return base64.b64encode(stream.getvalue()).decode()

@@ -9,12 +9,12 @@ import numpy as np
 
 from rigidmd.engines.system import Sites, System
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import FAINT, INK, camera
+from rigidmd.figures.style import FAINT, INK, UP, camera, draw_scale
 from rigidmd.io.bonds import COVALENT, connections
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
-from rigidmd.view.animation_page import data_part, packed, read_asset, script, stage
 from rigidmd.view.molecule_figure import COLOURS, OTHER
+from rigidmd.view.page import PagePart, read_asset
 
 #: Most coordinates in a page, of 2 bytes each: with base64 about 21 MB, plus 3 MB of chemiscope.
 MOST_COORDINATES = 8_000_000
@@ -86,39 +86,6 @@ def massive_bonds(system: System) -> list[list[int]]:
     return [[int(i), int(j), 1] for i, j in number[connections(system)]]
 
 
-def page_part(record: Record) -> tuple[list[str], list[str]]:
-    """The animation as HTML, and notes on data left out. Raises OutputError."""
-    code = chemiscope_script()
-    sites = record.molecules.sites
-    massive = np.flatnonzero(sites.mass > 0)
-    frames = frames_of(record, max(2, MOST_COORDINATES // (3 * len(massive))))
-    notes = describe_thinning(frames)
-    positions = frames.positions[:, massive]
-    if len(massive) < len(sites.mass):
-        notes.append("Sites without mass are not drawn.")
-    low, high = positions.min(), positions.max()
-    scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
-    data = {
-        "time": packed(frames.time, "<f8"),
-        "positions": packed(np.round((positions - low) / scale - LARGEST_INTEGER), "<i2"), "low": float(low),
-        "scale": scale, "steps": LARGEST_INTEGER, "elements": [str(element) for element in sites.element[massive]],
-        "bonds": massive_bonds(record.molecules),
-        "cells": None if frames.cells is None else packed(frames.cells.reshape(-1, 9), "<f4"),
-        "name": record.scene.name,
-    }  # fmt: skip
-    count = np.bincount(record.molecules.model.species, minlength=len(record.molecules.species))
-    legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, record.molecules.species, strict=True))
-    how = (
-        "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes. "
-        "Space plays. A click on a plot jumps to its time. Drawn by chemiscope (chemiscope.org)."
-    )
-    beneath = f'<p class="legend">{html.escape(legend)}</p><p class="faint noprint">{how}</p>'
-    picture = '<div class="molecules" id="film-picture"></div><div hidden id="film-meta"></div>'
-    picture += '<div hidden id="film-info"></div>'
-    parts = [stage(picture, beneath, record, notes), data_part(data), script(code)]
-    return [*parts, script(read_asset("film.js")), script(read_asset("molecules.js"))], notes
-
-
 #: Direction of the eye.
 EYE = np.array([0.45, -1.0, 0.33])
 #: Radius of a sphere in covalent radii, by which bonded spheres touch; default radius, Å.
@@ -130,19 +97,28 @@ LIGHT = np.array([-0.61, 0.79])
 HAZE = 0.5
 
 
-class MoleculeDrawing:
-    """Draws molecules at the times of an animation: lit spheres in the box, distant ones paler, and a scale."""
+class MoleculeAnimation:
+    """Molecules at the times of a trajectory: lit spheres in the box, distant ones paler, and a scale."""
 
-    def __init__(self, record: Record, frames: Frames):
+    def __init__(self, record: Record, most_frames: int | None = None):
         from matplotlib.colors import to_rgb
 
-        sites = record.molecules.sites
+        self._record, sites = record, record.molecules.sites
         self._shown = np.flatnonzero(sites.mass > 0)
-        elements = sites.element[self._shown]
-        self._radius = np.array([SPHERE_SCALE * COVALENT[e] if e in COVALENT else DEFAULT_RADIUS for e in elements])
-        self._color = np.array([to_rgb(COLOURS.get(e, OTHER)) for e in elements])
-        self._frames, self._view = frames, camera(EYE, np.array([0.0, 0.0, 1.0]))
+        self._frames = frames_of(record, most_frames or max(2, MOST_COORDINATES // (3 * len(self._shown))))
+        self.time, self.notes = self._frames.time, describe_thinning(self._frames)
+        self._elements = [str(element) for element in sites.element[self._shown]]
+        radii = [SPHERE_SCALE * COVALENT[e] if e in COVALENT else DEFAULT_RADIUS for e in self._elements]
+        self._radius, self._view = np.array(radii), camera(EYE, UP)
+        self._color = np.array([to_rgb(COLOURS.get(e, OTHER)) for e in self._elements])
         self._low, self._high = self._limits()
+
+    def loop_end(self) -> tuple[float, list[str]]:
+        """End of a film, and notes."""
+        return float(self.time[-1]), []
+
+    def film_notes(self, interval: float, seconds: float) -> list[str]:
+        return []
 
     def draw(self, axes, time: float) -> None:
         """Draw the last frame up to a time into axes, which are cleared."""
@@ -174,7 +150,9 @@ class MoleculeDrawing:
             )
         )  # fmt: skip
         self._box(axes, k, back=False)
-        self._scale(axes)
+        span = self._high[0] - self._low[0]
+        length = next(x for x in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if x < 0.3 * span or x == 1)
+        draw_scale(axes, self._high[0] - 0.03 * span, self._low[1] + 0.03 * span, length, f"{length} Å")
 
     def _corners(self, k: int) -> np.ndarray:
         cells = self._frames.cells
@@ -203,9 +181,27 @@ class MoleculeDrawing:
             if (i ^ j) in (1, 2, 4) and (furthest in (i, j)) == back:
                 axes.plot(*corners[[i, j], :2].T, color=FAINT if back else INK, lw=0.8, zorder=1 if back else 3)
 
-    def _scale(self, axes) -> None:
-        span = self._high[0] - self._low[0]
-        length = next(x for x in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if x < 0.3 * span or x == 1)
-        right, foot = self._high[0] - 0.03 * span, self._low[1] + 0.03 * span
-        axes.plot([right - length, right], [foot, foot], color=INK, lw=2, solid_capstyle="butt", zorder=4)
-        axes.text(right, foot + 0.012 * span, f"{length} Å", color=INK, fontsize=10, ha="right", va="bottom", zorder=4)
+    def page_part(self) -> PagePart:
+        """The animation by chemiscope. Raises OutputError."""
+        code, frames, molecules = chemiscope_script(), self._frames, self._record.molecules
+        positions = frames.positions[:, self._shown]
+        left_out = ["Sites without mass are not drawn."] if len(self._shown) < len(molecules.sites.mass) else []
+        low, high = positions.min(), positions.max()
+        scale = max(float(high - low), 1e-9) / (2 * LARGEST_INTEGER)
+        data = {
+            "time": frames.time.astype("<f8"),
+            "positions": np.round((positions - low) / scale - LARGEST_INTEGER).astype("<i2"), "low": float(low),
+            "scale": scale, "steps": LARGEST_INTEGER, "elements": self._elements, "bonds": massive_bonds(molecules),
+            "cells": None if frames.cells is None else frames.cells.reshape(-1, 9).astype("<f4"),
+            "name": self._record.scene.name,
+        }  # fmt: skip
+        count = np.bincount(molecules.model.species, minlength=len(molecules.species))
+        legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, molecules.species, strict=True))
+        usage = (
+            "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes. "
+            "Space plays. A click on a plot jumps to its time. Drawn by chemiscope (chemiscope.org)."
+        )
+        picture = '<div class="molecules" id="film-picture"></div><div hidden id="film-meta"></div>'
+        picture += '<div hidden id="film-info"></div>'
+        scripts = [code, read_asset("film.js"), read_asset("molecules.js")]
+        return PagePart(picture, html.escape(legend), usage, data, [*self.notes, *left_out], scripts)

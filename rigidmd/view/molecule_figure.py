@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.files import atomic_file
-from rigidmd.figures.style import COOL, FAINT, INK, save_figure, settings
+from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, save_figure, settings
 from rigidmd.io.bonds import COVALENT, bonds
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import Molecule
@@ -53,9 +53,7 @@ def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
     taken = _principal_axes(axes, m, view, half)
     _labels(axes, m, spheres, half, taken + bonded)
     length = 1.0 if half > 1.6 else 0.5
-    corner = np.array([-0.96, -0.95]) * half
-    axes.plot(corner[0] + np.array([0, length]), [corner[1]] * 2, color=INK, lw=2, solid_capstyle="butt")
-    axes.text(corner[0], corner[1] + 0.03 * half, f"{length:g} Å", color=INK, fontsize=FONT, ha="left", va="bottom")
+    draw_scale(axes, length - 0.96 * half, -0.95 * half, length, f"{length:g} Å", FONT)
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
     figure.text(0.03, 0.975, title, fontsize=min(13.0, 780 / len(title)), weight="bold", **plain)
     lines = [f"{m.name}: {m.description}"]

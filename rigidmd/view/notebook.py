@@ -24,16 +24,16 @@ from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
 from rigidmd.scene import BodyScene, MolecularScene, Scene
-from rigidmd.view.animation_page import body_part, read_asset
-from rigidmd.view.body_animation import animate_body
+from rigidmd.view.animation_page import FILM_STYLE, animation_parts
+from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.molecule_animation import describe_thinning, frames_of, inside, massive_bonds
-from rigidmd.view.page import Raw, figure, notes, page, table
+from rigidmd.view.page import Raw, figure, notes, page, read_asset, table
 from rigidmd.view.plots import record_of
 
 if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
 
-STYLE = Path(__file__).with_name("notebook.css").read_text(encoding="utf-8")
+STYLE = read_asset("notebook.css")
 #: What acts on a body: a table of its scene, and its title.
 ACTING = {"gravity": "gravity", "applied": "applied forces", "friction": "friction", "fluid": "a fluid",
           "frame": "a moving frame", "wheels": "wheels", "changing_inertia": "changing inertia"}  # fmt: skip
@@ -218,9 +218,7 @@ def show_animation(results: Results) -> "StructureWidget | AnimationPage":
     """The animation of results. Raises ImportError without chemiscope, ValueError without a trajectory."""
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
-        animation = animate_body(record)
-        name = results.system.scene.name
-        return AnimationPage(page(name, body_part(record, animation), f"<style>{read_asset('film.css')}</style>"))
+        return AnimationPage(page(record.scene.name, animation_parts(record, BodyAnimation(record)), FILM_STYLE))
     try:
         import chemiscope
     except ImportError:

@@ -5,13 +5,30 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, drawing, save_figure, settings
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
-STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+
+def read_asset(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+STYLE = read_asset("page.css")
+
+
+class PagePart(NamedTuple):
+    """An animation on a page."""
+
+    picture: str  # HTML
+    legend: str  # HTML
+    usage: str  # how to use it
+    data: dict[str, Any]  # for the scripts: JSON values and arrays
+    notes: list[str]
+    scripts: list[str]
 
 
 def page(title: str, parts: Iterable[str], head: str = "") -> str:

@@ -1,7 +1,7 @@
 """`rigidmd stability`: named cases that try to break the engine, each compared with a known answer."""
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import did_you_mean
@@ -19,10 +19,13 @@ def selected_cases(names: list[str] | None) -> list[StabilityCase]:
     return sorted(found, key=lambda case: case.group)
 
 
-def run_cases(names: list[str] | None = None, quick: bool = False, announce: Callable[[str], None] = lambda name: None):
-    """Yield the results of the named cases (default: all) in order, each announced by announce(name)."""
-    for case in selected_cases(names):
-        announce(case.name)
+def run_cases(
+    names: list[str] | None = None, quick: bool = False, progress: Callable[..., object] = lambda *_: None
+) -> Iterator[CaseResult]:
+    """Yield the results of the named cases (default: all) in order. progress(fraction done, name) : before each"""
+    cases = selected_cases(names)
+    for k, case in enumerate(cases):
+        progress(k / len(cases), case.name)
         result = CaseResult(case.name, case.group, case.sentence, *case.titles)
         began = clock.perf_counter()
         case.run(result, quick)
