@@ -214,7 +214,8 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
-    "studies.sweep.sweeping": "format_ranges format_walltime write_slurm_script",
+    "studies.sweep.plan": "Axis parse_axis",
+    "studies.sweep.sweeping": "Waiting code_kind format_ranges format_walltime run_points write_slurm_script",
     "view.animation": "write_film",
     "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS find_example notebooks",
@@ -359,9 +360,7 @@ HOMES = {
     "studies.accuracy.accuracy": "measure_accuracy",
     "studies.stability.stability": "run_cases selected_cases",
     "studies.stability.cases": "CASES StabilityCase",
-    "studies.sweep.axes": "Axis parse_axis",
     "studies.sweep.backends": "Cluster Pool",
-    "studies.sweep.running": "Waiting code_kind run_points",
     "studies.sweep.table": "SweepRow summarise_run",
     "studies.verify": "verify",
 }
@@ -372,7 +371,7 @@ RENAMED = {
     "SAMPLE_NUMBERS": "engines.samples:NUMBERS",
     "SHIPPED": "core.shipped:SYSTEMS",
     "draw_analysis_curve": "analysis.files:draw_curve",
-    "axis_settings": "studies.sweep.axes:settings",
+    "axis_settings": "studies.sweep.plan:settings",
     "gromacs_unsupported": "engines.gromacs.files:unsupported_features",
     "lennard_jones_energy_and_force": "forces.potentials.lennard_jones:energy_and_force",
     "lennard_jones_tail": "forces.potentials.lennard_jones:tail",

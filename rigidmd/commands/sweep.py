@@ -63,7 +63,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from rigidmd.errors import OutputError
-    from rigidmd.studies.sweep.axes import parse_axes
+    from rigidmd.studies.sweep.plan import parse_axes
     from rigidmd.studies.sweep.sweeping import open_existing_sweep, open_sweep
 
     _check(options)
@@ -102,8 +102,7 @@ def _check(options: argparse.Namespace) -> None:
 def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     from rigidmd.io.progress import progress_of
     from rigidmd.studies.sweep.backends import Cluster, Pool
-    from rigidmd.studies.sweep.running import SweepOutcome, run_points
-    from rigidmd.studies.sweep.sweeping import jobs_and_threads
+    from rigidmd.studies.sweep.sweeping import SweepOutcome, jobs_and_threads, run_points
 
     folder, manifest = sweep.folder, sweep.manifest
     jobs, threads = jobs_and_threads(sweep.left, options.jobs, options.threads, sweep.is_body)

@@ -49,7 +49,7 @@ def trial_table(found: IntegratorAccuracy) -> Table:
 
 
 def _bias(found: IntegratorAccuracy, trial: Trial, name: str) -> tuple[float, float] | None:
-    """An average less that of the trial with the smallest energy error, and the error; None for this trial itself."""
+    """Difference of an average from the trial with the smallest energy error, and its error; None for this trial."""
     (value, error), (best, its_error) = trial.averages[name], found.most_exact.averages[name]
     return None if trial is found.most_exact else (value - best, hypot(error, its_error))
 
