@@ -253,7 +253,7 @@ HOMES = {
     "compile.simd": "lane_count",
     "compile.machine": "MOST_THREADS",
     "compile.numba_private": "CacheIndex",
-    "commands.arguments": "read_scene",
+    "commands.arguments": "COMMANDS read_scene",
     "core.files": "AppendedFile",
     "core.integrators": "DRIFT FORMULATIONS Flow KICK REMOVE_MOMENTUM SCHEMES Solver WITH_THERMOSTAT composed split",
     "core.state": "HEAT Load ORIGIN STORED_NAMES REMOVED WORK no_load state_of",

@@ -17,6 +17,7 @@ from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 from support import (
     BUILDS,
     COLUMNS,
+    COMMANDS,
     MOLECULES,
     NOW,
     REMOVED,
@@ -1091,10 +1092,8 @@ def test_adding_a_command_takes_one_file(tmp_path, monkeypatch, capsys):
         "@command(5, 'greet someone', 'rigidmd greet Ada', arguments)\n"
         "def greet(options):\n    print(f'hello {options.name}')\n    return 3\n"
     )
-    import rigidmd.commands
-    from rigidmd.commands.arguments import COMMANDS
-
-    monkeypatch.setattr(rigidmd.commands, "__path__", [*rigidmd.commands.__path__, str(tmp_path)])
+    package = sys.modules["rigidmd.commands"]
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     with pytest.raises(SystemExit):
         main(["--help"])
     listed = capsys.readouterr().out
