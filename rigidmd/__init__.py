@@ -5,6 +5,10 @@ import rigidmd
 scene = rigidmd.Scene.read("water.toml")
 results = rigidmd.Simulation(scene).run()
 print(results["temperature"].mean(), results.units["temperature"], results.universe())
+
+with rigidmd.Simulation(scene) as simulation:
+    simulation.step(100)  # the first 100 steps; simulation.run() would run the rest
+    print(simulation.state.time, simulation.state.position)
 """
 
 from importlib import import_module

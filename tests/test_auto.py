@@ -29,7 +29,7 @@ from support import (
 
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run import MolecularSimulation, Simulation
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -291,7 +291,7 @@ def test_the_estimated_bias_is_that_of_sampling_within_a_factor_of_two():
     stages += [stages[0] | {"timestep_fs": 2.0}]
     scene = small_scene({"spce": 64}, 12.42, forces={"cutoff_A": 6.0}, stages=stages)
     _, state = start_of_last_stage(scene)
-    rate = mean_square_rate(MolecularSimulation(scene).system, state, 1)
+    rate = mean_square_rate(Simulation(scene).system, state, 1)
     found = measure_averages(scene, ["velocity_verlet", "baoab"], [2.0, 4.0, 5.0], sample=200.0)
     potential = found.quantities[0]
     for run in found.runs:

@@ -270,14 +270,14 @@ def test_a_solver_of_many_steps_of_its_own_ends_between_two_looks_and_resumes_to
     for name, after in (("early", 3), ("late", 10 if integrator == "radau" else 250)):
         run = Simulation(scene, tmp_path / name, warn=str)
         counted = iter(range(after))
-        reset = run._reset
+        reset = run.part.reset
 
         def counting(reset=reset, run=run, counted=counted):
             reset()
             halts = run.engine.stop_requested
             run.engine.stop_requested = lambda: halts() or (next(counted, None) is None and (run.stop(15) or True))
 
-        run._reset = counting
+        run.part.reset = counting
         results = run.run()
         assert (results.interrupted, results.signal, results.out_of_time) == (True, 15, False)
         assert run.engine.chosen_steps[0] == after + 1

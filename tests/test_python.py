@@ -1,5 +1,6 @@
 """From Python: units of results, data frames, what notebooks and editors show."""
 
+import contextlib
 import csv
 import json
 import re
@@ -9,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Observation, load_model, small_scene
+from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Observation, contents, load_model, small_scene
 
 import rigidmd
-from rigidmd.errors import SceneError
+from rigidmd.errors import OutputError, SceneError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import KJ_PER_MOL
@@ -170,7 +171,7 @@ def test_values_show_what_they_are(tmp_path):
     scene = Scene.read(TOP, SHORT)
     assert repr(scene) == "<BodyScene heavy_top_3: one body, pinned; 0.05 s in 100 steps of 0.0005 s, kahan_li_8>"
     simulation = Simulation(scene)
-    assert repr(simulation).startswith("<BodySimulation heavy_top_3: one body (symmetric, pinned)")
+    assert repr(simulation).startswith("<Simulation heavy_top_3: one body (symmetric, pinned)")
     assert "results stay in memory" in repr(simulation)
     results = simulation.run()
     assert repr(results).startswith("<Results of heavy_top_3: 101 samples, no files;")
@@ -210,7 +211,8 @@ if isinstance(scene, rigidmd.BodyScene):
 """
 HOVER = {
     "scene": "MolecularScene | BodyScene",
-    "simulation": "MolecularSimulation | BodySimulation",
+    "simulation": "Simulation",
+    "simulation.state": "State",
     "results": "Results",
     'results["energy"]': "ndarray[",
     "results.universe()": "Universe",
@@ -325,15 +327,6 @@ def test_paths_and_numbers_of_types_in_a_scene(tmp_path):
         Scene.from_dict(data | {"seed": deep}, tmp_path)
 
 
-def test_a_simulation_that_lacks_a_hook_is_not_made():
-    class Half(Simulation):
-        def introduction(self):
-            return "half"
-
-    with pytest.raises(TypeError, match="abstract class Half"):
-        Half(Scene.read(TOP, SHORT))
-
-
 def test_the_package_says_that_it_has_types():
     import tomllib
 
@@ -341,3 +334,140 @@ def test_the_package_says_that_it_has_types():
         assert "py.typed" in tomllib.load(file)["tool"]["setuptools"]["package-data"]["rigidmd"]
     assert (ROOT / "rigidmd" / "py.typed").is_file()
     assert all(hasattr(rigidmd, name) for name in rigidmd.__all__)
+
+
+# steps
+
+
+def heavy_top(folder=None, **options):
+    scene = Scene.read(TOP, SHORT | {"run.integrator": "velocity_verlet", "output.trajectory": False})
+    return Simulation(scene, folder, **options)
+
+
+@pytest.mark.parametrize("make", [argon, heavy_top])
+def test_steps_are_the_steps_of_a_run(make, tmp_path):
+    """Over the end of a stage and past the end of the scene, mixed with `run`; files and bits are those of `run`."""
+    seen, whole = [], make(tmp_path / "whole", observers=Every(0.002, lambda moment: None)).run()
+    count = int(whole.state.step[0])
+    simulation = make(tmp_path / "steps", observers=Every(0.002, lambda moment: seen.append(moment.step)))
+    assert simulation.step() == 1 and simulation.state.step[0] == 1
+    assert seen[0] == 0 and seen[-1] <= 1
+    with pytest.raises(RuntimeError, match="the run has begun"):
+        simulation.take_threads(1)
+    with pytest.raises(OutputError, match="another run is writing"):
+        make(tmp_path / "steps", force=True).run()
+    assert simulation.step(7) == 7
+    assert not (tmp_path / "steps" / "summary.json").exists()
+    for left in (count // 2, count):
+        assert simulation.step(left) == min(left, count - 8 - (0 if left < count else count // 2))
+    assert simulation.step(3) == 0
+    results = simulation.run()
+    assert not results.interrupted and results.state.step[0] == count
+    assert all(np.array_equal(a, b) for a, b in zip(results.state, whole.state, strict=True))
+    assert contents(tmp_path / "steps") == contents(tmp_path / "whole")
+    again = make(observers=Every(0.002, seen.append))
+    again.step(5)
+    assert np.array_equal(again.run().state.velocity, whole.state.velocity)
+    with pytest.raises(ValueError, match="at least one step"):
+        again.step(0)
+
+
+@pytest.mark.parametrize("make", [argon, heavy_top])
+@pytest.mark.parametrize("how", ["close", "with", "error", "stop"])
+def test_a_run_that_is_closed_between_steps_has_all_files_and_resumes(make, how, tmp_path):
+    whole, looks = tmp_path / "whole", Every(0.002, lambda moment: None)
+    make(whole, observers=looks).run()
+    folder = tmp_path / "steps"
+    if how in ("close", "stop"):
+        simulation = make(folder, observers=looks)
+        simulation.step(9)
+        if how == "stop":
+            simulation.stop()
+            assert simulation.step(5) == 0 and simulation.run().interrupted
+        simulation.close()
+        simulation.close()
+    else:
+        with contextlib.suppress(KeyError), make(folder, observers=looks) as simulation:
+            simulation.step(9)
+            if how == "error":
+                raise KeyError
+    assert json.loads((folder / "summary.json").read_text())["interrupted"]
+    assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
+    with make(folder, observers=looks, resume=True) as simulation:
+        simulation.step(2)
+        assert simulation.state.step[0] == 11
+        assert not simulation.run().interrupted
+    assert contents(folder) == contents(whole)
+    with make(tmp_path / "to the end") as simulation:
+        simulation.step(10**6)
+    assert not json.loads((tmp_path / "to the end" / "summary.json").read_text())["interrupted"]
+
+
+@pytest.mark.parametrize("ends", ["exit", "deleted", "signal"])
+def test_a_run_that_nobody_closes_lets_its_folder_go(ends, tmp_path):
+    program = f"""
+import gc, os, signal, sys
+import rigidmd
+scene = rigidmd.Scene.read({str(TOP)!r}, {SHORT | {"output.trajectory": False}!r})
+simulation = rigidmd.Simulation(scene, "run", observers=[rigidmd.Every(0.001, lambda moment: moment.step == 15 and
+    {ends!r} == "signal" and os.kill(os.getpid(), signal.SIGINT))])
+simulation.step(9)
+if {ends!r} == "deleted":
+    del simulation
+    gc.collect()
+    rigidmd.Simulation(scene, "run", resume=True).run()
+elif {ends!r} == "signal":
+    try:
+        simulation.step(50)
+    except KeyboardInterrupt:
+        sys.exit(simulation.state.step[0] >= 15 and os.path.exists("run/summary.json"))
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (int(ends == "signal"), "")
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["interrupted"] == (ends != "deleted")
+    heavy_top_scene = Scene.read(tmp_path / "run" / "scene.toml")
+    assert not Simulation(heavy_top_scene, tmp_path / "run", resume=True).run().interrupted
+
+
+class Plain:
+    """An observer without a base class."""
+
+    interval = 0.01
+
+    def __init__(self):
+        self.times = []
+
+    def see(self, moment):
+        self.times.append(moment.time)
+
+
+class PlainWithFile(Plain):
+    def files(self):
+        return ["times.txt"]
+
+    def end(self, run, results):
+        run.path("times.txt").write_text(str(len(self.times)))
+        results.files.append(run.path("times.txt"))
+
+
+def test_an_observer_is_any_object_with_an_interval_and_see(tmp_path):
+    one, two = Plain(), PlainWithFile()
+    results = argon(tmp_path / "out", observers=[one, two]).run()
+    assert one.times == two.times == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
+    assert (tmp_path / "out" / "times.txt").read_text() == "5" and tmp_path / "out" / "times.txt" in results.files
+    argon(observers=one).run()
+    assert len(one.times) == 10
+    for wrong in (3, print, object(), [one, "see"]):
+        with pytest.raises(TypeError, match="is not an observer"):
+            argon(observers=wrong)
+
+
+def test_a_simulation_takes_what_its_kind_of_scene_has():
+    assert type(argon()) is type(heavy_top()) is rigidmd.Simulation
+    with pytest.raises(SceneError, match="applied: for a single body"):
+        argon(applied={"push": lambda pose: ((0, 0, 0), (0, 0, 0))})
+    with pytest.raises(SceneError, match="forces and thermostat: for molecules"):
+        heavy_top(forces=[], thermostat=3)
+    for method in ("start", "settle", "atoms"):
+        with pytest.raises(TypeError, match="is a single body; this method is for molecules"):
+            getattr(heavy_top(), method)()

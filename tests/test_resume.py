@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
@@ -26,8 +27,13 @@ from support import (
     PREVIOUS,
     ROOT,
     AppendedFile,
+    Arrays,
+    BodyRecord,
+    BodyRun,
     Checkpoint,
     FolderLock,
+    MolecularRecord,
+    MolecularRun,
     checkpoint,
     contents,
     provenance,
@@ -160,7 +166,7 @@ def again(stopped, tmp_path):
 def test_the_command_resume_goes_on_and_lengthens(again, capsys):
     folder = str(again / "run")
     assert cli.main(["resume", folder]) == 0
-    assert read_checkpoint(again / "run" / CHECKPOINT).values["place"]["first"] == 0
+    assert read_checkpoint(again / "run" / CHECKPOINT).values["of"]["run"]["position"]["first"] == 0
     assert cli.main(["run", str(again / "water.toml"), "-o", folder, "--resume", "--until", "0.12ps"]) == 0
     steps = [int(line.split(",")[0]) for line in (again / "run" / "log.csv").read_text().splitlines()[1:]]
     assert steps == list(range(0, 121, 10))
@@ -243,7 +249,7 @@ def test_an_input_that_changes_meanwhile_is_the_one_that_was_read(stopped, tmp_p
     away = Every(0.05, lambda moment: (tmp_path / "start.npz").unlink(missing_ok=True))
     results = Simulation(Scene.from_dict(data, tmp_path), tmp_path / "run", observers=away).run()
     assert results.summary["input_sha256"] == {"structure.file": digest}
-    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).values["run"]["inputs"] == {"structure.file": digest}
+    assert read_checkpoint(tmp_path / "run" / CHECKPOINT).values["of"]["run"]["inputs"] == {"structure.file": digest}
 
 
 def test_another_scene_is_not_gone_on_with(again, capsys):
@@ -537,9 +543,83 @@ def test_observers_of_a_checkpoint_are_known_by_what_they_are(again):
     assert not (again / "two" / "energy.png").exists() or "energy.png" in (again / "two" / ".rigidmd-run").read_text()
 
 
+@dataclass
+class LongerRecord(MolecularRecord):
+    """A record with fields that no code of the package knows."""
+
+    seen: int = 0
+    names: dict[int, list[str]] = field(default_factory=dict)
+    squares: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    tables: Arrays = field(default_factory=dict)
+
+
+@dataclass
+class LongerBodyRecord(BodyRecord):
+    seen: int = 0
+
+
+@pytest.mark.parametrize("kind", ["molecules", "body"])
+def test_a_field_that_is_added_to_the_record_survives_a_stop(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(MolecularRun, "record_type", LongerRecord)
+    monkeypatch.setattr(BodyRun, "record_type", LongerBodyRecord)
+    data = forty_waters(NVT, threads=1) if kind == "molecules" else top("velocity_verlet")
+    interval, stop = (0.01, 0.04) if kind == "molecules" else (0.02, 0.1)
+    left, reached = {stop}, []
+
+    def count(moment):
+        record = simulation.part.record
+        record.seen += 1
+        reached.append(record.seen)
+        if kind == "molecules":
+            record.names[moment.step] = [f"at {moment.step}"]
+            record.squares = np.arange(record.seen) ** 2.0
+            record.tables[f"at {moment.step}"] = np.full(2, moment.time)
+        if moment.time > 0.99 * stop and left:
+            left.clear()
+            simulation.stop()
+
+    for resume in (False, True):
+        simulation = Simulation(
+            Scene.from_dict(data), tmp_path / "run", observers=Every(interval, count), resume=resume
+        )
+        assert simulation.run().interrupted != resume
+    assert reached == list(range(1, len(reached) + 1)) and len(reached) > 10
+    if kind == "molecules":
+        record = simulation.part.record
+        assert list(record.names.values()) == [[f"at {10 * k}"] for k in range(len(reached))]
+        assert record.squares.tolist() == [k**2 for k in range(len(reached))]
+        assert len(record.tables) == len(reached) and record.tables["at 20"].tolist() == pytest.approx([0.02, 0.02])
+
+
+class Remembering(Every):
+    """Declares what it remembers, and no code for it."""
+
+    remembers = {"counted": int, "times": np.ndarray}  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__(0.01, self.count)
+        self.counted, self.times = 0, np.zeros(0)
+
+    def count(self, moment) -> None:
+        self.counted, self.times = self.counted + 1, np.append(self.times, moment.time)
+
+
+def test_what_an_observer_remembers_is_declared_once(again):
+    data = forty_waters(NVT, threads=1)
+    for stops in ({40}, set()):
+        counts = Remembering()
+        Simulation(Scene.from_dict(data), again / "two", resume=True, observers=[counts, stopped_at(stops)]).run()
+    assert counts.counted == 11 and counts.times == pytest.approx(0.01 * np.arange(11))
+    kept = read_checkpoint(again / "two" / CHECKPOINT)
+    kept.values["of"]["user-Remembering"]["counted"] = "many"
+    write_checkpoint(again / "two", kept)
+    with pytest.raises(CheckpointError, match="integer"):
+        Simulation(Scene.from_dict(data), again / "two", resume=True, observers=[Remembering()]).run()
+
+
 def test_a_checkpoint_of_another_version_is_refused(again, capsys):
     kept = read_checkpoint(again / "run" / CHECKPOINT)
-    for schema, age in ((1, "an earlier"), (99, "a later")):
+    for schema, age in ((1, "an earlier"), (2, "an earlier"), (99, "a later")):
         told = np.frombuffer(json.dumps(kept.values | {"schema": schema}).encode(), np.uint8)
         for name in (CHECKPOINT, PREVIOUS):
             with zipfile.ZipFile(again / "run" / name, "w") as archive:

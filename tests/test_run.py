@@ -1247,7 +1247,7 @@ def test_the_lists_of_the_start_serve_the_first_stage(monkeypatch):
     simulation = Simulation(small_scene({"argon": 20}, 25.0, stages=stages))
     simulation.start_from(simulation.state)
     made.clear()
-    simulation._reset()
+    simulation.part.reset()
     simulation.run()
     used = [engine for engine in made if engine.workspaces]
     assert len(used) == 2

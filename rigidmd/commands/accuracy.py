@@ -47,12 +47,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 )  # fmt: skip
 def _accuracy(options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
-    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.io.folder import FolderLock, check_folder, make_folder
     from rigidmd.studies.accuracy.accuracy import measure_accuracy
     from rigidmd.studies.accuracy.report import FILES, recommendations, table_text, write_accuracy
 
     scene = read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
+    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
     integrators = options.integrators.split(",") if options.integrators else None
     try:
@@ -68,7 +69,7 @@ def _accuracy(options: argparse.Namespace) -> int:
             scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
         )
     print(*recommendations(found), "", table_text(found), sep="\n")
-    make_folder(folder, options.force, FILES)
+    make_folder(folder, FILES, lock)
     written = write_accuracy(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
@@ -77,16 +78,17 @@ def _accuracy(options: argparse.Namespace) -> int:
 def _averages(
     options: argparse.Namespace, scene, folder: Path, methods: list[str] | None, timesteps: list[float] | None
 ) -> int:
-    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.io.folder import FolderLock, check_folder, make_folder
     from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
     from rigidmd.studies.accuracy.averages_report import FILES, bias_conclusions, table_text, write_averages
 
+    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
     with progress_bar("compiling, and running what comes before the last stage") as progress:
         found = measure_averages(scene, methods, timesteps, sample, progress)
     print(table_text(found), "", *bias_conclusions(found), sep="\n")
-    make_folder(folder, options.force, FILES)
+    make_folder(folder, FILES, lock)
     written = write_averages(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0

@@ -23,16 +23,17 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _stability(options: argparse.Namespace) -> int:
     import platform
 
-    from rigidmd.io.folder import check_folder, make_folder
+    from rigidmd.io.folder import FolderLock, check_folder, make_folder
     from rigidmd.studies.stability.report import FILES, conclusions, has_failed, table_text, write_stability
     from rigidmd.studies.stability.stability import run_cases
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
+    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
     with progress_bar() as progress:
         results = list(run_cases(options.case, options.quick, progress))
     print(table_text(results), "", *conclusions(results), sep="\n")
-    make_folder(folder, options.force, FILES)
+    make_folder(folder, FILES, lock)
     machine = platform.processor() or platform.machine()
     written = write_stability(folder, results, command_line(), machine)
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")

@@ -13,8 +13,8 @@ from rigidmd.core.files import atomic_file, sync_file, unreadable_reason
 from rigidmd.errors import CheckpointError
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
-#: Version of the format. Version 1 (rigidmd 0.1) named observers by their number.
-SCHEMA = 2
+#: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record of the run.
+SCHEMA = 3
 #: Members besides the arrays of the run: all other values as JSON, and names, lengths and CRC-32 of all other members.
 JSON, CONTENTS = "told", "contents"
 
@@ -28,13 +28,6 @@ class Checkpoint(NamedTuple):
         start = f"{owner}/"
         found = {name.removeprefix(start): array for name, array in self.arrays.items() if name.startswith(start)}
         return Checkpoint(dict(self.values["of"].get(owner, {})), found)
-
-
-def count_list(values: Any) -> list[int]:
-    """A list of counts from a checkpoint. Raises ValueError for anything else."""
-    if not isinstance(values, list) or not all(type(value) is int and value >= 0 for value in values):
-        raise ValueError(f"{values!r:.60} is not a list of sizes and checksums of a file")
-    return values
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:

@@ -63,18 +63,13 @@ def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> No
     write_text(folder / marker, "\n".join(dict.fromkeys(names)) + "\n")
 
 
-def make_folder(
-    folder: Path, force: bool, names: Iterable[str], inputs: Iterable[Path] = (), lock: "FolderLock | None" = None
-) -> None:
-    """Make the folder of a run that will write these files. Only files that an earlier run wrote are removed. `lock` is
-    taken as soon as the folder exists. Raises OutputError."""
-    names = list(names)
-    check_folder(folder, force, inputs, names)
+def make_folder(folder: Path, names: Iterable[str], lock: "FolderLock") -> None:
+    """Make the folder of a run that will write these files, after `check_folder`. Only files that an earlier run wrote
+    are removed. lock : was taken before the check, and is taken now if the folder is new. Raises OutputError."""
     with writing(folder, "made"):
-        folder.mkdir(parents=True, exist_ok=True)
-        if lock is not None and not lock.is_taken:
+        if not lock.is_taken:
+            folder.mkdir(parents=True)  # an error if another run has made it since the check
             lock.take()
-            check_folder(folder, force, inputs, names)  # another run may have made it meanwhile
         for name in written_by_runs(folder):
             (folder / name).unlink(missing_ok=True)
         write_marker(folder, names)
@@ -111,7 +106,7 @@ class FolderLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._lock = FileLock(folder / LOCK, timeout=0)
+        self._lock = FileLock(folder / LOCK, timeout=0, thread_local=False)  # any thread may end a run
 
     @property
     def is_taken(self) -> bool:

@@ -1,12 +1,8 @@
 """Runs of molecules and single bodies, from a scene to its results."""
 
-from rigidmd.run.body import BodySimulation
-from rigidmd.run.molecular import MolecularSimulation
 from rigidmd.run.observers import Every, Moment, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
 from rigidmd.run.together import run_together
 
-__all__ = [
-    "BodySimulation", "Every", "MolecularSimulation", "Moment", "Observer", "Results", "Simulation", "run_together",
-]  # fmt: skip
+__all__ = ["Every", "Moment", "Observer", "Results", "Simulation", "run_together"]

@@ -1,10 +1,10 @@
 """Runs of a single body: samples at regular times, columns at the end, figures."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf
-from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 from pydantic import PositiveFloat
 
@@ -15,111 +15,96 @@ from rigidmd.core.state import NOW, ORIGIN
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import Engine
-from rigidmd.errors import SceneError, SimulationError
+from rigidmd.errors import SimulationError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
-from rigidmd.run.options import Options
+from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import fastest_body_rate, stable_angle
-from rigidmd.run.pilot.trial_systems import choose_for_body
-from rigidmd.run.provenance import plain
 from rigidmd.run.report import body_summary_text
-from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
+from rigidmd.run.resume import RunRecord, check_same_scene, state_from
 from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
-from rigidmd.run.simulation import Simulation
 from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
 
+if TYPE_CHECKING:
+    from rigidmd.run.simulation import Simulation
 
-class BodyResumeData(ResumeData):
-    """Resume data of the run of a body."""
+
+@dataclass
+class BodyRecord(RunRecord):
+    """The record of a run of a body."""
 
     stable: PositiveFloat | None = None  # the longest stable step, s
 
 
-class BodySimulation(Simulation):
-    """A scene of a single body, ready to run. Besides the parameters of `Simulation`:
-
-    applied : name -> function of a `Pose` that gives a force (3,) in N along the lab's axes, at the centre of mass, and
-        a torque (3,) in N m along the body's axes. It is called once for each position of the body. Forces that
-        depend on the velocity are constant within a step, which reduces its order to 1
-    """
+class BodyRun(RunPart):
+    """The part of a simulation of a single body."""
 
     time_unit = "s"
-    _summary_text = staticmethod(body_summary_text)
+    record_type = BodyRecord
+    summary_text = staticmethod(body_summary_text)
 
-    scene: BodyScene
     system: BodySystem
     engine: Engine
+    record: BodyRecord
 
     def __init__(
-        self, scene: BodyScene, folder: str | Path | None = None, force: bool = False, *,
-        applied: Mapping[str, Callable[[Pose], tuple]] | None = None, **options: Unpack[Options],
-    ):  # fmt: skip
-        if of_molecules := [key for key in ("forces", "thermostat") if key in options]:
-            raise SceneError(
-                scene.source,
-                [f"{' and '.join(of_molecules)}: for molecules; a single body takes applied={{name: function}}"],
-            )
-        super().__init__(scene, folder, force, **options)
+        self, simulation: "Simulation", scene: BodyScene, applied: Mapping[str, Callable[[Pose], tuple]] | None
+    ):
+        super().__init__(simulation)
         self._choice = None
         applied = dict(applied or {})
         if scene.run.is_auto:
-            self._announce("choosing integrator and step by pilot runs")
-            self.scene, self._choice = choose_for_body(scene, applied)
-        self.system = build_body(self.scene, applied)
-        self.scene = self.system.scene
-        self.threads = 1
-        self._reset()
+            from rigidmd.run.pilot.trial_systems import choose_for_body
 
-    def _reset(self) -> None:
+            simulation.announce("choosing integrator and step by pilot runs")
+            scene, self._choice = choose_for_body(scene, applied)
+        self.system = build_body(scene, applied)
+        self._segments = self._equal_step_segments()
+        self.reset()
+
+    def reset(self) -> None:
+        super().reset()
         self.engine = self.system.engine()
-        self.engine.stop_requested = self._must_end
+        self.engine.stop_requested = self.simulation.must_end
         self.state = self.engine.begin(self.system.state, self.system.method)
 
-    def _prepare(self) -> None:
-        self._announce(f"compiling ({describe_cache()})")
-        self.engine.advance(self.state, self.system.method, self.scene.run.timestep_s, 0)
-        self._reset()
-        self._segments = self._equal_step_segments()
-        rate, angle = fastest_body_rate(self.system), stable_angle(self.system.method)
-        followed = self.scene.watch.stable_step and rate > 0 and angle < inf  # some solvers choose their own steps
-        self._resume_data = BodyResumeData(stable=angle / rate if followed else None)
-        if (stable := self._resume_data.stable) is not None and self.scene.run.timestep_s > stable:
-            self.note(
-                f"timestep_s = {self.scene.run.timestep_s:g} is longer than what is stable: at its start the body "
-                f"swings or spins at {rate:.3g} rad/s, which {self.scene.run.integrator} can follow "
-                f"up to {stable:.3g} s"
+    def prepare(self) -> None:
+        self.simulation.announce(f"compiling ({describe_cache()})")
+        system, run, compiled = self.system, self.scene.run, self.system.engine()
+        compiled.advance(compiled.begin(system.state, system.method), system.method, run.timestep_s, 0)
+        rate, angle = fastest_body_rate(system), stable_angle(system.method)
+        if not self.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
+            return
+        stable = self.record.stable = angle / rate
+        if run.timestep_s > stable:
+            self.simulation.note(
+                f"timestep_s = {run.timestep_s:g} is longer than what is stable: at its start the body swings or spins "
+                f"at {rate:.3g} rad/s, which {run.integrator} can follow up to {stable:.3g} s"
             )
 
-    def _durations(self) -> list[float]:
+    def durations(self) -> list[float]:
         return [segment.steps * segment.dt for segment in self._segments]
 
-    def _enter_segment(self, k: int) -> Segment:
+    def enter_segment(self, k: int) -> Segment:
         if k > 0:
             self.state.begin_segment(self.system.breaks()[k - 1])
             self.engine.change(*self.system.terms_at(float(self.state.time[NOW])))
         return self._segments[k]
 
-    def _resume_json(self) -> dict[str, Any]:
-        return self._resume_data.to_json(scene=plain(self.scene), notes=self.notes)
-
-    def _restore(self, kept: Checkpoint) -> None:
-        self._resume_data = read_as(BodyResumeData, kept.values["run"])
-        self._warnings.extend(self._resume_data.notes)
-        self._segments = self._equal_step_segments()
-        arrays, method = kept.of("state").arrays, self.system.method
-        check_same_scene(self.scene, self._resume_data.scene, {}, int(arrays["step"][NOW]))
+    def restore(self, kept: Checkpoint) -> None:
+        arrays, method, k = kept.of("state").arrays, self.system.method, self.record.position.segment
+        check_same_scene(self.scene, self.record.scene, {}, int(arrays["step"][NOW]))
         self.state = state_from(arrays, self.state, exact=isinstance(method, Scheme))
-        k = kept.values["place"]["stretch"]
         if k > 0:
             self.engine.change(*self.system.terms_at(float(self.state.time[ORIGIN])))
         self.engine.recall(self.state, kept.of("engine").arrays)
         self.engine.check(self.state, method, self._segments[k].dt, self.system.state if k == 0 else None)
 
-    def _reenter_segment(self, k: int) -> Segment:
+    def reenter_segment(self, k: int) -> Segment:
         return self._segments[k]
 
     def _equal_step_segments(self) -> list[Segment]:
@@ -137,41 +122,41 @@ class BodySimulation(Simulation):
             steps += whole
         return segments
 
-    def _observe(self, moment: Moment) -> Pose:
+    def observe(self, moment: Moment) -> Pose:
         return self.system.pose(moment.time, moment._state)
 
-    def _default_observers(self) -> list[Observer]:
+    def default_observers(self) -> list[Observer]:
         output, interval = self.scene.output, not_none(self.scene.output.interval_s)
-        self._sampler, self._watch = Sampler(interval), BodyWatch(self)
+        self._sampler, self._watch = Sampler(interval), BodyWatch(self.simulation)
         files: list[Observer] = []
         if output.trajectory:
             with_velocities = output.trajectory.endswith((".trr", ".nc"))
             files = [Frames(interval, not_none(output.topology), output.trajectory, with_velocities)]
-        if self.folder is not None:
+        if self.simulation.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
             files += [Figures()] if output.figures else []
         return [*files, self._sampler, self._watch]
 
-    def _samples(self) -> Motion:
+    def samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)
 
-    def _summary(self, samples: Motion, times: RunTimes) -> dict[str, Any]:
+    def summary(self, samples: Motion, times: RunTimes) -> dict[str, Any]:
         steps = sum(segment.steps for segment in self._segments)
-        found = summarise_body(self.system, samples, steps, times, self._interrupted)
-        found["stable_timestep_s"] = self._resume_data.stable
+        found = summarise_body(self.system, samples, steps, times, self.simulation.is_interrupted)
+        found["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
-            self.note(
+            self.simulation.note(
                 "the motion is stiff: stability, not accuracy, limits the steps of dop853; integrator = 'radau' takes "
                 "much longer ones"
             )
-        found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.notes]
+        found["notes"] = [*([self._choice] if self._choice else []), *found["notes"], *self.record.notes]
         return found
 
-    def _explain(self, error: SimulationError) -> str:
-        return self._watch.check.explain(error, self.segment.dt, self._resume_data.stable)
+    def explain(self, error: SimulationError) -> str:
+        return self._watch.check.explain(error, self.segment.dt, self.record.stable)
 
     @property
-    def _headline(self) -> str:
+    def headline(self) -> str:
         system, run = self.system, self.scene.run
         pinned = "" if system.translates else ", pinned"
         return (
@@ -181,8 +166,9 @@ class BodySimulation(Simulation):
 
     def start_energy(self) -> dict:
         """Energies at the start in J, force in N along the lab's axes, torque in N m along the body's."""
+        self.reset()
         with interruptible():
-            self._prepare()
+            self.prepare()
         load, _ = self.engine.evaluate(self.state)
         seen = motion(self.system, [Snapshot(0.0, self.state)])
         torque = load.torque_body @ self.system.axes.T

@@ -1,11 +1,10 @@
 """Observers of a single body: snapshots, checks, motion.csv, figures."""
 
-from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from rigidmd.core.state import NOW, STORED_NAMES
+from rigidmd.core.state import NOW, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.figures.body import FIGURES, draw_motion
 from rigidmd.figures.run import body_figures
@@ -14,36 +13,43 @@ from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.run.checks import EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK, BodyCheck
 from rigidmd.run.observers import Moment, Observer
-from rigidmd.run.resume import state_from
+from rigidmd.run.resume import Arrays, NotNegative, state_from
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
-    from rigidmd.run.body import BodySimulation
     from rigidmd.run.results import Results
+    from rigidmd.run.simulation import Simulation
 
 
 class Sampler(Observer):
     """Keeps snapshots, of which columns are made at the end."""
 
+    remembers: ClassVar[dict[str, Any]] = {"stacked": Arrays}
     ends = True
 
     def __init__(self, interval: float):
         self.interval = interval
         self.snapshots: list[Snapshot] = []
 
-    def memory(self) -> Checkpoint:
-        stacked = {
-            name: np.array([snapshot.state[k] for snapshot in self.snapshots]) for k, name in enumerate(STORED_NAMES)
-        }
-        return Checkpoint({}, stacked | {"t": np.array([snapshot.time for snapshot in self.snapshots])})
+    @property
+    def stacked(self) -> dict[str, np.ndarray]:
+        """The arrays of all snapshots, by name."""
+        found = {name: np.array([seen.state[k] for seen in self.snapshots]) for k, name in enumerate(STORED_NAMES)}
+        return found | {"t": np.array([seen.time for seen in self.snapshots])}
 
-    def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        times = kept.arrays["t"]
+    @stacked.setter
+    def stacked(self, stacked: dict[str, np.ndarray]) -> None:
+        times = stacked.pop("t")
+        states = [State(*(stacked[name][k] for name in STORED_NAMES)) for k in range(len(times))]
+        self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        super().resume(run, kept)
+        times = np.array([seen.time for seen in self.snapshots])
         if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.state.time[NOW]).all()):
             raise ValueError("the times of its samples cannot be of a run")
-        arrays = [{name: array[k] for name, array in kept.arrays.items() if name != "t"} for k in range(len(times))]
-        states = [state_from(of, run.state, exact=False) for of in arrays]
-        self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
+        for seen in self.snapshots:
+            state_from(dict(zip(STORED_NAMES, seen.state, strict=True)), run.state, exact=False)
 
     def see(self, moment: Moment) -> None:
         self.snapshots.append(Snapshot(moment.time, moment.state))
@@ -52,9 +58,10 @@ class Sampler(Observer):
 class BodyWatch(Observer):
     """Checks the state against the limits of the scene, independent of the interval of samples."""
 
+    remembers: ClassVar[dict[str, Any]] = {"exchanged": NotNegative}
     ends = True
 
-    def __init__(self, run: "BodySimulation"):
+    def __init__(self, run: "Simulation"):
         self.check = BodyCheck(run.system, run.scene.watch)
         every = max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
         # at most half a second of computing
@@ -63,13 +70,19 @@ class BodyWatch(Observer):
         )
         self._run = run
 
-    def memory(self) -> Checkpoint:
-        return Checkpoint({"moved": self.check.exchanged}, {})
+    @property
+    def exchanged(self) -> float:
+        """The largest energy exchanged so far, J."""
+        return float(self.check.exchanged)
 
-    def resume(self, run: "BodySimulation", kept: Checkpoint) -> None:
-        least, self.check.exchanged = self.check.exchanged, float(kept.values["moved"])
-        if not least <= self.check.exchanged < inf:
-            raise ValueError(f"it has exchanged an energy of {self.check.exchanged:g} J")
+    @exchanged.setter
+    def exchanged(self, exchanged: float) -> None:
+        if exchanged < self.check.exchanged:
+            raise ValueError(f"it has exchanged an energy of {exchanged:g} J")
+        self.check.exchanged = exchanged
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        super().resume(run, kept)
         if problem := self.check.failed_check(run.state, run.scene.run.timestep_s):
             raise ValueError(f"its state cannot be of this run: {problem}")
 
@@ -87,7 +100,7 @@ class MotionFiles(Observer):
     def files(self) -> list[str]:
         return [MOTION, MOTION_NPZ]
 
-    def end(self, run: "BodySimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         if not isinstance(samples := results.samples, Motion):
             raise TypeError("these are samples of molecules")
         write_columns(run.path(MOTION), samples.written)
@@ -96,7 +109,7 @@ class MotionFiles(Observer):
             write_npz(run.path(MOTION_NPZ), samples.written)
             results.files.append(run.path(MOTION_NPZ))
 
-    def failed(self, run: "BodySimulation") -> str:
+    def failed(self, run: "Simulation") -> str:
         if not self._sampler.snapshots:
             return ""
         write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).written)
@@ -111,7 +124,7 @@ class Figures(Observer):
     def files(self) -> list[str]:
         return [f"{figure}.{suffix}" for figure in FIGURES for suffix in ("png", "svg")]
 
-    def end(self, run: "BodySimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         if isinstance(results.samples, Motion):
             failed = None
             for stem, figure in body_figures(run.system, results.samples).items():

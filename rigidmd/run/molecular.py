@@ -1,13 +1,12 @@
 """Runs of molecules: removal of overlaps, stages of all ensembles, samples."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from math import isfinite, nan
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field, PositiveFloat
+from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build
 from rigidmd.assemble.stage_flows import integrator_of_stage
@@ -32,18 +31,17 @@ from rigidmd.run.force_errors import coulomb_errors
 from rigidmd.run.minimise import minimise
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
-from rigidmd.run.options import Options
 from rigidmd.run.overlap_removal import OverlapRemoval, remove_overlaps
+from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.shadow import choose_for_averages
 from rigidmd.run.pilot.stable_step import is_estimate_cheap, stable_angle, stiffest_mode
 from rigidmd.run.pilot.trial_systems import choose_for_molecules
 from rigidmd.run.provenance import plain
 from rigidmd.run.quantity_docs import describe_quantities
 from rigidmd.run.report import summary_text
-from rigidmd.run.resume import ResumeData, check_same_scene, read_as, state_from
+from rigidmd.run.resume import Count, RunRecord, check_same_scene, state_from
 from rigidmd.run.segments import RunTimes, Segment
 from rigidmd.run.signals import interruptible
-from rigidmd.run.simulation import Simulation
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.run.user_force_check import check_forces
 from rigidmd.scene import MolecularScene
@@ -54,97 +52,100 @@ if TYPE_CHECKING:
     import ase
 
     from rigidmd.engines.external import ExternalEngine
+    from rigidmd.run.simulation import Simulation
 
 
-Count = Annotated[int, Field(ge=0)]
-
-
-class MolecularResumeData(ResumeData):
-    """Resume data of a run of molecules. Dictionaries have the indices of stages."""
+@dataclass
+class MolecularRecord(RunRecord):
+    """The record of a run of molecules. Dictionaries have the indices of stages."""
 
     stages: tuple[Stage, ...] = ()  # with the integrators that were chosen
-    stage: Count = 0  # the present one
-    removal: OverlapRemoval | None = Field(None, serialization_alias="relief", validation_alias="relief")
-    choices: dict[Count, str] = Field(default_factory=dict)  # of integrator and step, with the reasons
-    stable: dict[Count, PositiveFloat] = Field(default_factory=dict)  # the longest stable step, ps
-    moves: dict[Count, tuple[Count, Count]] = Field(default_factory=dict)  # of the box, tried and accepted
-    minima: dict[Count, Minimum] = Field(default_factory=dict)
+    removal: OverlapRemoval | None = None
+    choices: dict[Count, str] = field(default_factory=dict)  # of integrator and step, with the reasons
+    stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
+    moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)  # of the box, tried and accepted
+    minima: dict[Count, Minimum] = field(default_factory=dict)
 
 
 #: States between the last good one and a failure that are searched for its cause.
 REPLAYED = 20
 
 
-class MolecularSimulation(Simulation):
-    """A scene of molecules, ready to run. Besides the parameters of `Simulation`:
-
-    forces : user-defined forces, besides the forces of the scene: `rigidmd.Force`, `rigidmd.pair_law`, terms of classes
-        with `rigidmd.compiled_force`, or objects whose method term(system) makes such a term. At the start forces and
-        torques are compared with differences of the energy, and the virial with the effect of a strain of the box
-    thermostat : a user-defined thermostat for every stage: a NamedTuple of a class with `rigidmd.compiled_thermostat`,
-        or an object whose method for_stage(system, k) makes one
-    """
+class MolecularRun(RunPart):
+    """The part of a simulation of molecules."""
 
     time_unit = "ps"
-    _summary_text = staticmethod(summary_text)
+    record_type = MolecularRecord
+    summary_text = staticmethod(summary_text)
 
-    scene: MolecularScene
     system: System
+    engine: Engine
+    record: MolecularRecord
 
-    def __init__(
-        self, scene: MolecularScene, folder: str | Path | None = None, force: bool = False, *, forces: Any = (),
-        thermostat: Any = None, **options: Unpack[Options],
-    ):  # fmt: skip
-        super().__init__(scene, folder, force, **options)
+    def __init__(self, simulation: "Simulation", scene: MolecularScene, forces: Any, thermostat: Any):
+        super().__init__(simulation)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
-        self._built = build(scene.with_user_code(given, thermostat))
-        if clash := [name for name in self._built.user_terms if name in COLUMNS]:
-            raise SceneError(
-                scene.source, [f"{name} is a column of the log; name the force otherwise" for name in clash]
-            )
-        self.threads = usable_threads(scene.threads)
-        self._reset()
+        self._start = build(scene.with_user_code(() if forces is None else given, thermostat))
+        if clash := [name for name in self._start.user_terms if name in COLUMNS]:
+            errors = [f"{name} is a column of the log; name the force otherwise" for name in clash]
+            raise SceneError(scene.source, errors)
+        self.reset()
+
+    @property
+    def threads(self) -> int:
+        return usable_threads(self.scene.threads)
 
     def start_from(self, state: State) -> None:
-        """Let runs begin at the given positions and momenta, without removal of overlaps."""
-        self._built = replace(self._built, state=state_of(*state[:5]), from_lattice=False)
-        self._reset()
+        """See `Simulation.start_from`."""
+        self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
+        self.reset()
 
     def take_threads(self, count: int) -> None:
-        """Set the number of threads. Results do not depend on it."""
-        scene = self._built.scene.model_copy(update={"threads": count})
-        self._built = replace(self._built, scene=scene)
-        self.threads = usable_threads(count)
-        self._reset()
+        """See `Simulation.take_threads`."""
+        self._start = replace(self._start, scene=self._start.scene.model_copy(update={"threads": count}))
+        self.reset()
 
     def atoms(self) -> "ase.Atoms":
-        """The present state as an `ase.Atoms`, exactly: see `Results.atoms`. Observers may call it."""
+        """See `Simulation.atoms`."""
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> OverlapRemoval | None:
-        """Go to the state before the first step, from which `run` starts. Returns the removal of overlaps."""
-        self._reset()
+        """See `Simulation.start`."""
+        self.reset()
         with interruptible():
             self._remove_overlaps()
-        return self._resume_data.removal
+        return self.record.removal
 
     def settle(self) -> State:
-        """Go to the state after removal of overlaps and the minimisations that come first, from which time passes."""
+        """See `Simulation.settle`."""
         self.start()
         for k, stage in enumerate(self.scene.stages):
             if not stage.is_minimisation:
                 break
-            self._enter_minimisation(k)
+            self.enter_segment(k)
             self._minimise(False)
         return self.state
 
-    def _reset(self) -> None:
-        self.system = self._built  # an earlier run may have chosen an integrator
-        self.scene = self.system.scene
+    def reset(self) -> None:
+        super().reset()
+        self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
 
-    def _prepare(self) -> None:
+    def _set_stages(self, stages: Iterable[Stage]) -> None:
+        """Set the stages of the run, some of which may have been chosen by pilot runs."""
+        self.record.stages = tuple(stages)
+        scene = self._start.scene.model_copy(update={"stages": self.record.stages})
+        self.system = replace(self._start, scene=scene)
+        self._integrators: dict[int, Scheme] = {}
+
+    def _integrator(self, k: int) -> Scheme:
+        """The integrator of stage k with its thermostat and barostat, made once."""
+        if k not in self._integrators:
+            self._integrators[k] = integrator_of_stage(self.system, k)
+        return self._integrators[k]
+
+    def prepare(self) -> None:
         """Remove overlaps, and compile the steps, or compare the start with an external engine."""
         if self.scene.engine.is_external:
             from rigidmd.engines.external import external_engine
@@ -159,7 +160,7 @@ class MolecularSimulation(Simulation):
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
-        self._announce(f"compiling ({describe_cache()})")
+        self.simulation.announce(f"compiling ({describe_cache()})")
         with user_errors_explained(self.system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
@@ -189,13 +190,13 @@ class MolecularSimulation(Simulation):
                     )
         check_forces(self.system, self.state)
         self.engine.forget()
-        self._resume_data = MolecularResumeData(removal=removal)
+        self.record.removal = removal
 
     def _compile(self) -> None:
         with user_errors_explained(self.system):
             for k, stage in enumerate(self.scene.stages):
                 if not (stage.is_auto or stage.is_minimisation):
-                    method = integrator_of_stage(self.system, k)
+                    method = self._integrator(k)
                     self.engine.advance(self._state_for(method), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
@@ -225,89 +226,78 @@ class MolecularSimulation(Simulation):
         self.engine_version = other.version
         return other
 
-    def _resume_json(self) -> dict[str, Any]:
-        scene, stages = plain(self._built.scene), self.scene.stages
-        return self._resume_data.to_json(scene=scene, inputs=self._inputs, stages=stages, notes=self.notes)
-
-    def _restore(self, kept: Checkpoint) -> None:
-        data = self._resume_data = read_as(MolecularResumeData, kept.values["run"])
-        before = data.scene["stages"]
+    def restore(self, kept: Checkpoint) -> None:
+        record = self.record
+        before, k = record.scene["stages"], record.position.segment
         # integrators that were chosen stand in the scene of the folder
         decided = [
             then if now.is_auto else plain(chosen)
-            for now, then, chosen in zip(self.scene.stages, before, data.stages, strict=False)
+            for now, then, chosen in zip(self.scene.stages, before, record.stages, strict=False)
         ]
         step = int(kept.arrays["state/step"][NOW])
-        check_same_scene(self._built.scene, data.scene | {"stages": decided or before}, data.inputs, step)
-        for k, (chosen, then) in enumerate(zip(data.stages, before, strict=True)):
-            if k not in data.choices and plain(chosen) != then:
-                raise ValueError(f"its stages.{k} differs from its scene")
-        known = (*data.choices, *data.stable, *data.moves, *data.minima)
-        if data.stage != kept.values["place"]["stretch"] or any(k > data.stage for k in known):
-            raise ValueError(f"it has data of later stages than {data.stage}, or is of another stage")
-        stages = list(data.stages)
-        stages[-1] = stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
-        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
-        self.system = replace(self.system, scene=self.scene)
-        self._warnings.extend(data.notes)
-        method = self._reenter_segment(data.stage).method
-        self.engine = self._engine_of(data.stage)
-        like = self._built.state._replace(extra_variables=self.engine.variables(self._built.state, method))
+        check_same_scene(self.scene, record.scene | {"stages": decided or before}, record.inputs, step)
+        for stage, (chosen, then) in enumerate(zip(record.stages, before, strict=True)):
+            if stage not in record.choices and plain(chosen) != then:
+                raise ValueError(f"its stages.{stage} differs from its scene")
+        if any(stage > k for stage in (*record.choices, *record.stable, *record.moves, *record.minima)):
+            raise ValueError(f"it has data of later stages than {k}")
+        last = record.stages[-1].model_copy(update={"duration_ps": self.scene.stages[-1].duration_ps})
+        self._set_stages((*record.stages[:-1], last))
+        method = self.reenter_segment(k).method
+        self.engine = self._engine_of(k)
+        start = self.system.state
+        like = start._replace(extra_variables=self.engine.variables(start, method))
         self.state = state_from(kept.of("state").arrays, like)
-        moves = any(before.has_barostat or before.is_minimisation for before in stages[: data.stage + 1])
-        if not moves and not np.array_equal(self.state.cell, self._built.state.cell):
+        moves = any(before.has_barostat or before.is_minimisation for before in record.stages[: k + 1])
+        if not moves and not np.array_equal(self.state.cell, start.cell):
             raise ValueError("its box differs from the box of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
 
-    def _reenter_segment(self, k: int) -> Segment:
+    def reenter_segment(self, k: int) -> Segment:
         stage = self.scene.stages[k]
         step = stage.timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
-            return Segment(stage.scheme, step, 0, action=None if k in self._resume_data.minima else self._minimise)
-        return Segment(integrator_of_stage(self.system, k), step, stage.steps)
+            return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
+        return Segment(self._integrator(k), step, stage.steps)
 
-    def _durations(self) -> list[float]:
+    def durations(self) -> list[float]:
         return [stage.duration for stage in self.scene.stages]
 
-    def _enter_segment(self, k: int) -> Segment:
-        self._resume_data.moves[self._resume_data.stage] = self.engine.moves or (0, 0)
-        self._resume_data.stage = k
-        if self.scene.stages[k].is_minimisation:
-            return self._enter_minimisation(k)
-        if was_auto := self.scene.stages[k].is_auto:
+    def enter_segment(self, k: int) -> Segment:
+        record = self.record
+        record.moves[record.position.segment] = self.engine.moves or (0, 0)
+        record.position.segment = k
+        if (stage := self.scene.stages[k]).is_minimisation:
+            self.engine = self.system.engine()
+            self.state = self._state_for(stage.scheme)
+            self.state.begin_segment()
+            return self.reenter_segment(k)
+        if was_auto := stage.is_auto:
             self._choose(k)
         self._estimate(k)
         # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene repeats the run to the
         # bit. The lists of the start, if nothing has moved since, are what new ones would be.
-        removal = self._resume_data.removal
-        if k or was_auto or self.scene.engine.is_external or (removal and removal.steps):
+        if k or was_auto or self.scene.engine.is_external or (record.removal and record.removal.steps):
             self.engine = self._engine_of(k)
-        method, stage = integrator_of_stage(self.system, k), self.scene.stages[k]
-        self.state = self._state_for(method)
+        segment = self.reenter_segment(k)
+        self.state = self._state_for(segment.method)
         self.state.begin_segment()
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
         if before and keeps(k) and not keeps(before[-1]):
             self.state.energy_ledger[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
-        return Segment(method, stage.timestep_fs * FEMTOSECOND, stage.steps)
-
-    def _enter_minimisation(self, k: int) -> Segment:
-        stage = self.scene.stages[k]
-        self.engine = self.system.engine()
-        self.state = self._state_for(stage.scheme)
-        self.state.begin_segment()
-        return Segment(stage.scheme, stage.timestep_fs * FEMTOSECOND, 0, action=self._minimise)
+        return segment
 
     def _minimise(self, progress: bool | None) -> None:
         """Run the present stage, a minimisation, with a warning if it does not converge."""
-        k = self._resume_data.stage
+        k = self.record.position.segment
         stage = self.scene.stages[k]
-        with progress_of(stage.most_iterations, "iterations", progress, self._spot) as bar:
-            found = minimise(self.system, self.state, stage, self._must_end, bar.update)
+        with progress_of(stage.most_iterations, "iterations", progress, self.simulation.spot) as bar:
+            found = minimise(self.system, self.state, stage, self.simulation.must_end, bar.update)
         self.engine.forget()
-        self._resume_data.minima[k] = found
+        self.record.minima[k] = found
         if not found.converged:
-            self.note(f"stages.{k}: {describe_minimum(found, stage)}")
+            self.simulation.note(f"stages.{k}: {describe_minimum(found, stage)}")
 
     def _estimate(self, k: int) -> None:
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
@@ -318,9 +308,9 @@ class MolecularSimulation(Simulation):
         found = stiffest_mode(self.system, self.state, self.engine if self.engine.is_repeatable else None)
         if found is None:
             return
-        stable = self._resume_data.stable[k] = stable_angle(stage.scheme) / found.rate
+        stable = self.record.stable[k] = stable_angle(stage.scheme) / found.rate
         if stage.timestep_fs * FEMTOSECOND > stable:
-            self.note(
+            self.simulation.note(
                 f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is longer than what is stable: the stiffest motion "
                 f"at its start, of {checks.molecule_label(self.system, found.molecule)}, has a period of "
                 f"{2 * np.pi / found.rate / FEMTOSECOND:.3g} fs, which {stage.integrator} follows up to "
@@ -330,29 +320,27 @@ class MolecularSimulation(Simulation):
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
         stage = self.scene.stages[k]
-        self._announce("choosing integrator and step by pilot runs")
+        self.simulation.announce("choosing integrator and step by pilot runs")
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
         decided, reason = choose(self.system, self.state, k)
-        self._resume_data.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
-        stages = list(self.scene.stages)
-        stages[k] = decided
-        self.scene = self.scene.model_copy(update={"stages": tuple(stages)})
-        self.system = replace(self.system, scene=self.scene)
+        self.record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
+        stages = self.record.stages
+        self._set_stages((*stages[:k], decided, *stages[k + 1 :]))
         for sentence in self.scene.rounded_times([k]):
-            self.note(sentence)
-        if self.folder is not None:
-            self.write_scene(self.folder)
+            self.simulation.note(sentence)
+        if self.simulation.folder is not None:
+            self.simulation.write_scene(self.simulation.folder)
 
-    def _is_replaced(self, moment: Moment) -> bool:
+    def is_replaced(self, moment: Moment) -> bool:
         stages, k = self.scene.stages, moment.stage
-        if stages[k].is_minimisation and k not in self._resume_data.minima:
+        if stages[k].is_minimisation and k not in self.record.minima:
             return True  # the start
         ended = moment.step == sum(stage.steps for stage in stages[: k + 1])
         # an interrupted minimisation is repeated by a run that resumes, which also has another frame for it
-        ends_here = stages[k].is_minimisation and self._interrupted
+        ends_here = stages[k].is_minimisation and self.simulation.is_interrupted
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
-    def _is_finite(self) -> bool:
+    def is_finite(self) -> bool:
         state, extent = self.state, self.extent or largest_values(self.state)
         return all(map(isfinite, [*extent[:4], *state.energy_ledger.tolist(), *state.extra_variables.tolist()]))
 
@@ -361,7 +349,7 @@ class MolecularSimulation(Simulation):
         """Largest values in the state and its load, if they are known from the last step."""
         return self.engine.extent(self.state)
 
-    def _observe(self, moment: Moment) -> Observation:
+    def observe(self, moment: Moment) -> Observation:
         """The observation at a moment. The drift of its stage is counted from the last sample before the stage."""
         stage = self.scene.stages[moment.stage]
         is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
@@ -373,14 +361,14 @@ class MolecularSimulation(Simulation):
             verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
         )  # fmt: skip
 
-    def _default_observers(self) -> list[Observer]:
+    def default_observers(self) -> list[Observer]:
         output = self.scene.output
         interval = output.log_interval_ps
         check = checks.StepCheck(self.system, self.scene.watch)
-        self._sampler = Sampler(self, interval, check)
+        self._sampler = Sampler(self.simulation, interval, check)
         observers: list[Observer] = [self._sampler]
         if not self.scene.engine.is_external:  # external engines check their steps themselves
-            observers.append(StepWatch(self, check))
+            observers.append(StepWatch(self.simulation, check))
         files: list[Observer] = []
         if output.trajectory:
             velocities = bool(output.velocities)
@@ -388,25 +376,25 @@ class MolecularSimulation(Simulation):
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
         if output.pressure_tensor_interval_ps:
             files.append(PressureTensor(output.pressure_tensor_interval_ps))
-        if self.folder is not None:
+        if self.simulation.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
             files += [EnergyFigure()] if output.figures else []
         return [*files, *observers]
 
-    def _samples(self) -> Samples:
+    def samples(self) -> Samples:
         return self._sampler.samples
 
-    def _summary(self, samples: Samples, times: RunTimes) -> dict[str, Any]:
-        data = self._resume_data
-        data.moves[data.stage] = self.engine.moves or (0, 0)
+    def summary(self, samples: Samples, times: RunTimes) -> dict[str, Any]:
+        record, interrupted = self.record, self.simulation.is_interrupted
+        record.moves[record.position.segment] = self.engine.moves or (0, 0)
         return summarise(
-            self.system, samples, self.state, data.removal.steps if data.removal else 0, times, self._interrupted,
-            data.choices, data.stable, data.moves, data.minima, self.notes,
+            self.system, samples, self.state, record.removal.steps if record.removal else 0, times, interrupted,
+            record.choices, record.stable, record.moves, record.minima, list(record.notes),
         )  # fmt: skip
 
-    def _explain(self, error: SimulationError) -> str:
-        stable = self._resume_data.stable.get(self._resume_data.stage)
+    def explain(self, error: SimulationError) -> str:
+        stable = self.record.stable.get(self.record.position.segment)
         return checks.explain(self.system, error, self._states_to_search(), self.segment.dt, stable)
 
     def _states_to_search(self) -> Iterator[tuple[str, State]]:
@@ -432,7 +420,7 @@ class MolecularSimulation(Simulation):
                 yield f"at step {to}, ", state
 
     @property
-    def _headline(self) -> str:
+    def headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
         more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
         return (

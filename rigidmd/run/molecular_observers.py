@@ -1,6 +1,6 @@
 """Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state, energy.png."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from rigidmd.core.state_file import write_state
 from rigidmd.engines.samples import Samples
 from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import save_figure
-from rigidmd.io.checkpoint import Checkpoint, count_list
+from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.io.log import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
@@ -18,8 +18,8 @@ from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.units import KJ_PER_MOL
 
 if TYPE_CHECKING:
-    from rigidmd.run.molecular import MolecularSimulation
     from rigidmd.run.results import Results
+    from rigidmd.run.simulation import Simulation
 
 
 class LogFile(GrowingFile):
@@ -33,16 +33,13 @@ class LogFile(GrowingFile):
     def files(self) -> list[str]:
         return [LOG]
 
-    def begin(self, run: "MolecularSimulation") -> None:
-        self._file = Log(run.path(LOG), self._tensor, user_terms=tuple(run.system.user_terms))
-
-    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        self._file = Log(run.path(LOG), self._tensor, count_list(kept.values["kept"]), tuple(run.system.user_terms))
+    def begin(self, run: "Simulation") -> None:
+        self._file = Log(run.path(LOG), self._tensor, self.kept, tuple(run.system.user_terms))
 
     def see(self, moment: Moment) -> None:
         self._file.write(moment.sample)
 
-    def end(self, run: "MolecularSimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         self._file.flush()
         results.files.append(run.path(LOG))
 
@@ -59,11 +56,8 @@ class PressureTensor(GrowingFile):
     def files(self) -> list[str]:
         return [TENSOR_FILE]
 
-    def begin(self, run: "MolecularSimulation") -> None:
-        self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE))
-
-    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
-        self._file = TensorFile(run.path(TENSOR_FILE), count_list(kept.values["kept"]))
+    def begin(self, run: "Simulation") -> None:
+        self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE), self.kept)
 
     def see(self, moment: Moment) -> None:
         row = tensor_row(moment.time, moment.observation.pressure_tensor_bar)
@@ -72,7 +66,7 @@ class PressureTensor(GrowingFile):
         else:
             self._file.write(row)
 
-    def end(self, run: "MolecularSimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         if self._file is None:
             results._tensor = np.array(self._rows)
         else:
@@ -90,9 +84,10 @@ class GoodState(NamedTuple):
 class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that passed."""
 
+    remembers: ClassVar[dict[str, Any]] = {"table": np.ndarray}
     ends = reads_energies = True
 
-    def __init__(self, run: "MolecularSimulation", interval: float, check: checks.StepCheck):
+    def __init__(self, run: "Simulation", interval: float, check: checks.StepCheck):
         self.interval = interval
         self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.user_terms))
         self.last_good: GoodState | None = None
@@ -116,7 +111,7 @@ class Sampler(Observer):
         kinetic = now.kinetic * KJ_PER_MOL
         if not self._check.thermal:
             self._check.rescale(kinetic)
-        if problem := self._check.failed_check(run.state, moment.observation.load, stage, run.extent):
+        if problem := self._check.failed_check(run.state, moment.observation.load, stage, run.part.extent):
             raise problem
         if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
             raise problem
@@ -133,12 +128,18 @@ class Sampler(Observer):
                 there[:] = here
         self.last_good = GoodState(step, time, kept)
 
-    def memory(self) -> Checkpoint:
-        return Checkpoint({}, {"samples": self.samples.table()})
+    @property
+    def table(self) -> np.ndarray:
+        return self.samples.table()
 
-    def resume(self, run: "MolecularSimulation", kept: Checkpoint) -> None:
+    @table.setter
+    def table(self, table: np.ndarray) -> None:
+        self.samples = Samples(self.samples.stages, self.samples.user_terms, table)
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Restore the samples. The state of the checkpoint is the last good one."""
-        self.samples = samples = Samples(self.samples.stages, self.samples.user_terms, kept.arrays["samples"])
+        super().resume(run, kept)
+        samples = self.samples
         steps, times, stages, conserved, drift = (
             samples[name] for name in ("step", "time", "stage", "conserved", "drift")
         )
@@ -155,7 +156,7 @@ class Sampler(Observer):
             self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
         self._keep(step, time)
 
-    def failed(self, run: "MolecularSimulation") -> str:
+    def failed(self, run: "Simulation") -> str:
         if run.folder is None or self.last_good is None:
             return ""
         path = run.path(LAST_GOOD)
@@ -168,7 +169,7 @@ class StepWatch(Observer):
 
     ends = True
 
-    def __init__(self, run: "MolecularSimulation", check: checks.StepCheck):
+    def __init__(self, run: "Simulation", check: checks.StepCheck):
         self.steps = checks.steps_between(run.system)
         self._run, self._check = run, check
 
@@ -177,7 +178,7 @@ class StepWatch(Observer):
         if load is None:
             return  # no force has been evaluated yet
         stage = run.scene.stages[moment.stage]
-        if problem := self._check.failed_check(run.state, load, stage, run.extent):
+        if problem := self._check.failed_check(run.state, load, stage, run.part.extent):
             raise problem
 
 
@@ -187,7 +188,7 @@ class FinalState(Observer):
     def files(self) -> list[str]:
         return [FINAL]
 
-    def end(self, run: "MolecularSimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         write_state(run.path(FINAL), run.system.saved(run.state))
         results.files.append(run.path(FINAL))
 
@@ -200,7 +201,7 @@ class EnergyFigure(Observer):
     def files(self) -> list[str]:
         return [ENERGY]
 
-    def end(self, run: "MolecularSimulation", results: "Results") -> None:
+    def end(self, run: "Simulation", results: "Results") -> None:
         for figure in run_figures(run.system, results.samples, results.summary).values():
             with atomic_file(run.path(ENERGY)) as temporary:
                 save_figure(figure, temporary, dpi=150)

@@ -1,22 +1,25 @@
 """Observers are called between the steps of a run. They read its state and never change it.
 
-All have the same methods: `files` (which it may write), `begin`, `see` (a moment), `end`. `see` is called every
-`interval` of time, counted in steps of each segment, or every `steps` steps, independent of the interval of results,
-and with `ends` also at the last moment of every segment. A time at which a minimisation begins has two states: with
-`once` only the second is observed. No observer depends on another: data that several need belong to the moment or run.
+An observer is any object with an `interval` and a method `see`; `Observer` has all other methods, which do nothing.
+`see` is called every `interval` of time, counted in steps of each segment, or every `steps` steps, independent of the
+interval of results, and with `ends` also at the last moment of every segment. A time at which a minimisation begins has
+two states: with `once` only the second is observed. No observer depends on another: data that several need belong to
+the moment or run.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from rigidmd.core.state import NOW, State
 from rigidmd.io.atoms import Frame
-from rigidmd.io.checkpoint import Checkpoint, count_list
+from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
+from rigidmd.run.resume import restored, stored
 
 if TYPE_CHECKING:
     from rigidmd.engines.samples import Sample
@@ -49,7 +52,7 @@ class Moment:
     def observation(self) -> Any:
         """Evaluated at its first use, for all observers: an `Observation` of molecules, in the units of the log, or the
         `Pose` of a body, in SI units."""
-        return self._run._observe(self)
+        return self._run.part.observe(self)
 
     @property
     def sample(self) -> "Sample":
@@ -75,8 +78,13 @@ def above_zero(interval: float, name: str) -> float:
 
 
 class Observer:
-    """Base class; its methods do nothing."""
+    """Base class; its methods do nothing.
 
+    remembers : name -> type of each attribute that a checkpoint has and a resumed run gets back: an array
+        (`np.ndarray`), arrays by name (`dict[str, np.ndarray]`), or what JSON can hold, which is checked
+    """
+
+    remembers: ClassVar[dict[str, Any]] = {}
     interval: float | None = None  # ps, or s for a single body
     steps: int | None = None
     ends = False
@@ -96,13 +104,15 @@ class Observer:
 
     def memory(self) -> Checkpoint:
         """The data that `resume` needs, for a checkpoint. Its files must be on the disk when it returns."""
-        return Checkpoint({}, {})
+        return stored(self, self.remembers)
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         """Called instead of `begin` when a run is resumed: restore the data of `memory`, and check files unchanged.
 
         The run is refused if this raises KeyError, TypeError, ValueError or OutputError.
         """
+        for name, value in restored(kept, self.remembers).items():
+            setattr(self, name, value)
         self.begin(run)
 
     def cut(self) -> None:
@@ -117,6 +127,23 @@ class Observer:
     def failed(self, run: "Simulation") -> str:
         """Called if the run stops with an error: save results. Returns a sentence that names the file, or ""."""
         return ""
+
+
+def as_observer(value: Any) -> Observer:
+    """An observer, or one that calls an object with `see` and `interval` (or `steps`, `ends`), which may also have any
+    of the other methods and attributes of `Observer` but `remembers`. Raises TypeError."""
+    if isinstance(value, Observer):
+        return value
+    is_timed = any(hasattr(value, name) for name in ("interval", "steps", "ends"))
+    if not is_timed or not callable(getattr(value, "see", None)):
+        raise TypeError(
+            f"{value!r:.60} is not an observer: it needs an interval and a method see(moment); "
+            "rigidmd.Every(interval, function) makes one of a function"
+        )
+    observer = type(type(value).__name__, (Observer,), {})()  # its name is in messages and checkpoints
+    given = {name: getattr(value, name) for name in dir(Observer) if name[0] != "_" and hasattr(value, name)}
+    vars(observer).update(given)
+    return observer
 
 
 class Every(Observer):
@@ -135,10 +162,13 @@ class Every(Observer):
 class GrowingFile(Observer):
     """An observer whose file grows during the run; None without a folder."""
 
+    remembers: ClassVar[dict[str, Any]] = {"kept": list[Annotated[int, Field(ge=0, strict=True)]]}
+    kept: list[int] | None = None  # sizes and checksum of the file of the run that is resumed, which `begin` opens
     _file: Any = None
 
     def memory(self) -> Checkpoint:
-        return Checkpoint({"kept": None if self._file is None else self._file.kept}, {})
+        self.kept = list(self._file.kept)
+        return super().memory()
 
     def cut(self) -> None:
         if self._file is not None:
@@ -178,6 +208,7 @@ class SceneFile(Observer):
 class Frames(GrowingFile):
     """Topology and trajectory; without a folder, frames in memory."""
 
+    remembers: ClassVar[dict[str, Any]] = GrowingFile.remembers | {"times": np.ndarray}
     once = True
 
     def __init__(
@@ -191,30 +222,28 @@ class Frames(GrowingFile):
     def files(self) -> list[str]:
         return self._names
 
-    def begin(self, run: "Simulation") -> None:
-        self._run, self._frames = run, []
-        if run.folder is not None:
-            from rigidmd.io.trajectory_writer import write_topology  # MDAnalysis is slow to import
+    @property
+    def times(self) -> np.ndarray:
+        return np.array([frame.time for frame in self._frames])
 
-            write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
-            self._open(None)
-
-    def memory(self) -> Checkpoint:
-        return super().memory()._replace(arrays={"time": np.array([frame.time for frame in self._frames])})
-
-    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
-        time, now = kept.arrays["time"], run.state.time[NOW]
-        *_, frames = counts = count_list(kept.values["kept"])
-        if time.shape != (frames,) or not ((time >= 0) & (time <= now)).all() or not (np.diff(time) >= 0).all():
+    @times.setter
+    def times(self, times: np.ndarray) -> None:
+        if times.ndim != 1 or not (times >= 0).all() or not (np.diff(times) >= 0).all():
             raise ValueError("the times of its frames are not those of a run")
-        self._run, self._frames = run, [Frame(time) for time in time.tolist()]
-        self._open(counts)
+        self._frames = [Frame(time) for time in times.tolist()]
 
-    def _open(self, kept: Sequence[int] | None) -> None:
-        from rigidmd.io.trajectory_writer import open_trajectory
+    def begin(self, run: "Simulation") -> None:
+        self._run = run
+        if run.folder is None:
+            return
+        from rigidmd.io.trajectory_writer import open_trajectory, write_topology  # MDAnalysis is slow to import
 
-        run, path = self._run, self._run.path(self._names[1])
-        self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, kept)
+        if self.kept is None:
+            write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
+        elif self.kept[-1:] != [len(self._frames)] or (self.times > run.state.time[NOW]).any():
+            raise ValueError("the times of its frames are not those of a run")
+        path = run.path(self._names[1])
+        self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, self.kept)
 
     def see(self, moment: Moment) -> None:
         system, state = self._run.system, self._run.state

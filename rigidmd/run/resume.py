@@ -1,20 +1,25 @@
-"""Checks of a checkpoint: that it belongs to the scene, and that its state and data are valid."""
+"""What a checkpoint has of a run: its record, the memories of observers; checks that both belong to the scene."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
 from rigidmd.errors import CheckpointError
+from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.run.provenance import NOT_COMPARED, computed_with, differences, input_digests, keys_of, plain
 from rigidmd.scene import MolecularScene, Scene
 
-T = TypeVar("T")
+Count = Annotated[int, Field(ge=0)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+#: Arrays by name, as the value of one field.
+Arrays = dict[str, np.ndarray]
 
 
 def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
@@ -73,27 +78,69 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
     return found
 
 
-def read_as(kind: type[T], data: Any) -> T:
-    """Data of a checkpoint, validated by pydantic as a type. Raises ValueError with one sentence."""
+def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
+    """Attributes of an object for a checkpoint, by their names and types: arrays as arrays, all others as JSON."""
+    arrays, plain_types = {}, {}
+    for name, kind in types.items():
+        if kind is np.ndarray:
+            arrays[name] = getattr(owner, name)
+        elif kind == Arrays:
+            arrays |= {f"{name}/{key}": array for key, array in getattr(owner, name).items()}
+        else:
+            plain_types[name] = kind
+    values = {name: getattr(owner, name) for name in plain_types}
+    found = _model_of(plain_types).model_construct(**values).model_dump(mode="json", exclude_none=True)
+    return Checkpoint({name: found.get(name) for name in plain_types}, arrays)
+
+
+def restored(kept: Checkpoint, types: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes that `stored` has written, validated. Raises ValueError or KeyError."""
+    arrays: dict[str, Any] = {name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray}
+    for name in (name for name, kind in types.items() if kind == Arrays):
+        start = f"{name}/"
+        arrays[name] = {key.removeprefix(start): kept.arrays[key] for key in kept.arrays if key.startswith(start)}
     try:
-        return TypeAdapter(kind).validate_python(data)
+        found = _model_of({name: types[name] for name in types if name not in arrays}).model_validate(kept.values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    return {name: getattr(found, name) for name in types if name not in arrays} | arrays
 
 
-class ResumeData(BaseModel):
-    """The data of a run, besides its state, that a checkpoint needs: what evolves, and the scene."""
+def _model_of(types: Mapping[str, Any]) -> type[BaseModel]:
+    config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", protected_namespaces=())
+    fields: Any = {name: (kind, ...) for name, kind in types.items()}
+    return create_model("Stored", __config__=config, **fields)
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants", populate_by_name=True)
 
-    scene: dict[str, Any] = {}
-    inputs: dict[str, str] = {}  # key -> SHA-256
-    notes: list[str] = []
+@dataclass
+class RunPosition:
+    """The position of a run in its segments."""
 
-    def to_json(self, **changes: Any) -> dict[str, Any]:
-        """JSON values for a checkpoint, which `read_as` reads."""
-        return self.model_copy(update=changes).model_dump(mode="json", exclude_none=True, by_alias=True)
+    segment: Count = 0
+    first: Count = 0  # steps before the segment
+    time: NotNegative = 0.0  # at the start of the segment, ps or s
+    computing: list[NotNegative] = field(default_factory=list)  # seconds, of the segments before
+    seconds: NotNegative = 0.0  # of computing in this segment
+
+
+@dataclass
+class RunRecord:
+    """What evolves in a run beside its state, its engine and its observers, and the input.
+
+    Every field of this class and its subclasses is in the checkpoints: `stored` and `restored` follow the annotations.
+    """
+
+    scene: dict[str, Any] = field(default_factory=dict)  # as JSON values
+    inputs: dict[str, str] = field(default_factory=dict)  # key -> SHA-256
+    notes: list[str] = field(default_factory=list)  # warnings
+    position: RunPosition = field(default_factory=RunPosition)
+
+    @classmethod
+    def types(cls) -> dict[str, Any]:
+        """Field -> its type."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {each.name: hints[each.name] for each in fields(cls)}
 
 
 @contextlib.contextmanager

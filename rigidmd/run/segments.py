@@ -1,16 +1,11 @@
-"""Segments of a run: runs of equal steps, the position of a run in them, when observers are called, computing times."""
+"""Segments of a run: runs of equal steps, when observers are called in them, computing times."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from operator import and_
-from typing import Annotated, Any, NamedTuple
-
-from pydantic import Field, NonNegativeInt
+from typing import NamedTuple
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.run.observers import Observer, above_zero
-from rigidmd.run.resume import read_as
-
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Segment(NamedTuple):
@@ -26,7 +21,7 @@ class Segment(NamedTuple):
 class ObservationSchedule:
     """When observers are called in a segment, in which steps are counted; lists have a value for each observer."""
 
-    def __init__(self, observers: Sequence[Observer], segment: Segment):
+    def __init__(self, observers: Collection[Observer], segment: Segment):
         self._last = segment.steps
         self._ends = [observer.ends for observer in observers]
         self._reads = [observer.reads_energies for observer in observers]
@@ -53,25 +48,6 @@ class ObservationSchedule:
     def reads_energies(self, due: list[bool]) -> bool:
         """Whether one of the observers that are due reads energies."""
         return any(map(and_, self._reads, due))
-
-
-class RunPosition(NamedTuple):
-    """The position of a run in its segments."""
-
-    segment: NonNegativeInt = 0
-    first: NonNegativeInt = 0  # steps before the segment
-    time: NonNegative = 0.0  # at the start of the segment, ps or s
-    computing: tuple[NonNegative, ...] = ()  # seconds, of the segments before
-    seconds: NonNegative = 0.0  # of computing in this segment
-
-    def to_json(self) -> dict[str, Any]:
-        """For a checkpoint, where the key of the segment is `stretch`."""
-        return {"stretch" if name == "segment" else name: value for name, value in self._asdict().items()}
-
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> "RunPosition":
-        """Raises ValueError."""
-        return read_as(RunPosition, {"segment" if key == "stretch" else key: data[key] for key in data})
 
 
 class RunTimes(NamedTuple):

@@ -14,7 +14,7 @@ from rigidmd.errors import OutputError, SceneError
 from rigidmd.io.folder import SCENE, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.io.write import writing
-from rigidmd.run import MolecularSimulation
+from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.molecules import EngineChoice
 
@@ -74,7 +74,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
 def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
     scene = system.scene.model_copy(update={"engine": EngineChoice()})
-    return MolecularSimulation(scene, warn=lambda sentence: None).settle()
+    return Simulation(scene, warn=lambda sentence: None).settle()
 
 
 def writer_for(to: str) -> EngineWriter:

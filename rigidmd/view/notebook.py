@@ -58,7 +58,7 @@ def simulation_html(simulation: Simulation) -> str:
     ]
     rows = [*(row for row in _rows(simulation.scene) if row[0] != USER_FORCES), *user_rows]
     rows += [("threads", str(simulation.threads)), ("writes to", where)]
-    if names := [type(observer).__name__ for observer in simulation._observers]:
+    if names := [type(observer).__name__ for observer in simulation.observers]:
         rows.append(("observers", ", ".join(names)))
     return _framed(simulation.scene.name, "ready to run: run() does it", _table(rows))
 

@@ -10,7 +10,7 @@ from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.momenta import remove_momentum
 from rigidmd.errors import SceneError, SimulationError
-from rigidmd.run.molecular import MolecularSimulation
+from rigidmd.run import Simulation
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
@@ -113,13 +113,13 @@ def measure_averages(
     return Averages(scene.name, stage.label, stage.temperatures[0], count, freedom.total, sample, quantities, runs)
 
 
-def start_of_last_stage(scene: MolecularScene) -> tuple[MolecularSimulation, State]:
+def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
     """A simulation of a scene, and the state in which its last stage begins. Earlier stages run without files."""
-    simulation = MolecularSimulation(scene)
+    simulation = Simulation(scene)
     if len(scene.stages) > 1:
         quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
         resolved = simulation.scene
-        earlier = MolecularSimulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
+        earlier = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
         return simulation, earlier.run().state
     simulation.start()
     return simulation, simulation.state
@@ -173,7 +173,7 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
     interval = max(SAMPLING_INTERVAL_PS, sample / MOST_SAMPLES)
     output = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
     changed = scene.model_copy(update={"stages": (stage,), "output": output})
-    simulation = MolecularSimulation(changed, observers=progress, warn=lambda warning: None)
+    simulation = Simulation(changed, observers=progress, warn=lambda warning: None)
     simulation.start_from(state)
     try:
         results = simulation.run(progress=False)

@@ -1,0 +1,379 @@
+"""The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with all files."""
+
+import contextlib
+import os
+import signal
+import time as clock
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
+from functools import partial
+from inspect import GEN_CLOSED, GEN_CREATED, GEN_RUNNING, getgeneratorstate
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidmd.core.process import PROCESS_LOCK
+from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
+from rigidmd.engines.protocol import Halted, NotFiniteError
+from rigidmd.errors import OutputError, RigidMDError, SimulationError
+from rigidmd.io.checkpoint import Checkpoint, latest
+from rigidmd.io.folder import (
+    CHECKPOINT,
+    PREVIOUS,
+    SUMMARY,
+    FolderLock,
+    check_folder,
+    check_names,
+    continue_folder,
+    is_empty,
+    make_folder,
+    never_began,
+)
+from rigidmd.io.progress import progress_of
+from rigidmd.run.checkpoints import SEGMENT_SECONDS, CheckpointSchedule
+from rigidmd.run.observers import Moment, Observer
+from rigidmd.run.provenance import computed_with, input_digests, plain, provenance
+from rigidmd.run.report import write_summary
+from rigidmd.run.results import Results
+from rigidmd.run.resume import as_checkpoint_errors, describe_changes, restored, stored
+from rigidmd.run.segments import ObservationSchedule, RunTimes
+from rigidmd.run.signals import interruptible, signal_handler, stop_signals
+
+if TYPE_CHECKING:
+    from rigidmd.run.simulation import Simulation
+
+#: Prefix of the names of user observers in a checkpoint, and the owner of the record of the run.
+USER, RECORD = "user-", "run"
+
+
+def _observers_by_name(default: Sequence[Observer], user: Sequence[Observer]) -> dict[str, Observer]:
+    """Observers by the names under which a checkpoint has their data: class, and number in its class."""
+    found: dict[str, Observer] = {}
+    for start, observers in (("", default), (USER, user)):
+        count: Counter[str] = Counter()
+        for observer in observers:
+            kind = type(observer).__name__
+            count[kind] += 1
+            found[f"{start}{kind}{f'-{count[kind]}' if count[kind] > 1 else ''}"] = observer
+    return found
+
+
+class RunLoop:
+    """A run of a simulation, from its beginning to its end.
+
+    drive : advances it; the run pauses in between, and then holds its folder and its files
+    advanced : steps of the last call of `drive`
+    results : of the run, after its end
+    """
+
+    def __init__(
+        self, simulation: "Simulation", observers: Sequence[Observer], force: bool, resume: bool, deadline: float | None
+    ):
+        self._simulation, self._folder = simulation, simulation.folder
+        self._part = simulation.part
+        self._user_observers, self._force, self._resume = observers, force, resume
+        minutes = simulation.scene.output.checkpoint_minutes
+        self.checkpoints = CheckpointSchedule(simulation.folder, minutes, deadline)
+        self.process = os.getpid()
+        self.interrupted = self.out_of_time = False
+        self.signal: int | None = None
+        self.results: Results | None = None
+        self.advanced = 0
+        self._error: Exception | None = None  # of an observer
+        self._failed_before: list[Observer] = []
+        self._bar, self._progress = progress_of(0.0, "", False), False
+        self._until = 0.0  # the step at which the run pauses
+        self._wall, self._since = 0.0, clock.perf_counter()  # seconds before, and the time since which it runs
+        self._observers: dict[str, Observer] = {}
+        self._course = self._run()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the run advances now: an observer may ask."""
+        return getgeneratorstate(self._course) == GEN_RUNNING
+
+    @property
+    def has_ended(self) -> bool:
+        return getgeneratorstate(self._course) == GEN_CLOSED
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all segments have been run."""
+        position, steps = self._part.record.position, int(self._part.state.step[NOW])
+        is_last = position.segment + 1 == len(self._part.durations())
+        return is_last and steps == position.first + self._part.segment.steps
+
+    def drive(self, steps: float, progress: bool | None) -> None:
+        """Let the run advance by at most this number of steps, or to its end."""
+        self._progress = progress
+        with contextlib.ExitStack() as stack:
+            if hasattr(signal, "SIGUSR1"):
+                stack.enter_context(signal_handler(self._simulation.ask_for_checkpoint, signal.SIGUSR1))
+            if getgeneratorstate(self._course) == GEN_CREATED:
+                next(self._course)
+            part, whole = self._part, sum(self._part.durations())
+            before = int(part.state.step[NOW])
+            self._until = before + steps
+            stack.enter_context(signal_handler(self._stop_by_signal, *stop_signals()))
+            self._bar = progress_of(whole, part.time_unit, progress if whole > 0 else False, self._simulation.spot)
+            stack.enter_context(self._bar).skip(float(part.state.time[NOW]))
+            self._since = clock.perf_counter()
+            next(self._course, None)
+            self._wall += clock.perf_counter() - self._since
+        if steps < inf and self.signal is not None:
+            signal.raise_signal(self.signal)
+        self.advanced = int(part.state.step[NOW]) - before
+
+    def _run(self) -> Generator[None]:
+        """The run. It pauses before its first step, and whenever step `_until` is reached."""
+        simulation, part = self._simulation, self._part
+        with contextlib.ExitStack() as stack:
+            kept, stays = None, False
+            if self._folder is not None:
+                lock = FolderLock(self._folder)
+                stack.callback(self._if_not_forked, lock.release)
+                lock.take()
+                if self._resume:
+                    kept, stays = self._read_checkpoint(self._folder)
+            part.reset()
+            began, input_sha256 = clock.perf_counter(), input_digests(simulation.scene)
+            scene, changed = plain(simulation.scene), None
+            if kept is not None:
+                with as_checkpoint_errors(self._folder):
+                    part.record = part.record_type(**restored(kept.of(RECORD), part.record_type.types()))
+                    part.restore(kept)
+                    part.check_position()
+                    changed = describe_changes(kept.values["with"])
+            part.record.scene, part.record.inputs = scene, input_sha256
+            self._observers = _observers_by_name(part.default_observers(), self._user_observers)
+            observers = list(self._observers.values())
+            names = [name for observer in observers for name in observer.files()]
+            names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
+            if self._folder is not None and stays:
+                check_names(self._folder, names)
+            elif self._folder is not None:
+                source = Path(simulation.scene.source)
+                inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
+                check_folder(self._folder, self._force, inputs, names)
+            if kept is None:
+                with interruptible(), PROCESS_LOCK:  # of several runs one compiles, and the others read its cache
+                    part.prepare()
+            preparing = clock.perf_counter() - began
+            for observer in observers:
+                stack.push(partial(self._close, observer))
+            if kept is not None:  # all checks come before the first change of a file
+                with as_checkpoint_errors(self._folder):
+                    for name, observer in self._observers.items():
+                        if name.startswith(USER) and name not in kept.values["of"]:
+                            observer.begin(simulation)
+                        else:
+                            observer.resume(simulation, kept.of(name))
+                if changed is not None:
+                    simulation.note(changed)
+                simulation.announce(f"continuing from step {part.state.step[NOW]}")
+            if self._folder is not None and stays:
+                continue_folder(self._folder, names)
+            elif self._folder is not None:
+                make_folder(self._folder, names, lock)
+            yield
+            for observer in observers:
+                if kept is None:
+                    observer.begin(simulation)
+                else:
+                    observer.cut()
+            try:
+                yield from self._run_segments(kept is not None)
+                while self._until < inf and self.signal is None and self._error is None:
+                    yield  # `run` or `close` completes the run
+                wall = self._wall + clock.perf_counter() - self._since
+                self._finish(RunTimes(preparing, wall, part.record.position.computing))
+            except (SimulationError, OutputError) as error:
+                self._check_process()
+                raise self._failed(error) from None
+            except Exception as error:  # of a user force, or of an observer, after which all files are complete
+                if error is not self._error and os.getpid() == self.process:
+                    for observer in observers:
+                        with contextlib.suppress(Exception):  # the first error is the one to report
+                            observer.failed(simulation)
+                raise
+
+    def _if_not_forked(self, function: Callable[[], object]) -> None:
+        """Call a function unless this is a forked process: files and locks belong to the process that was forked."""
+        if os.getpid() == self.process:
+            function()
+
+    def _close(self, observer: Observer, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """Close the files of an observer; of two errors the earlier one is reported."""
+        with contextlib.suppress(*([] if error is None else [OutputError])):
+            self._if_not_forked(observer.close)
+
+    def _check_process(self) -> None:
+        if os.getpid() != self.process:
+            raise OutputError("a forked process cannot continue the run: the files belong to the process that began it")
+
+    def _finish(self, times: RunTimes) -> None:
+        """Make the results, with all files written. Raises OutputError."""
+        simulation, part, notes = self._simulation, self._part, self._part.record.notes
+        results = Results(part.system, part.state, part.samples())
+        results.interrupted, results.signal, results.out_of_time = self.interrupted, self.signal, self.out_of_time
+        made_by = provenance(simulation.scene, part.threads, part.record.inputs, part.engine_version)
+        results.summary = made_by | part.summary(results.samples, times)
+        noted = len(notes)
+        for draws in (False, True):  # results first, pictures after
+            for observer in self._observers.values():
+                if observer.draws == draws:
+                    self._call_observer(observer, observer.end, simulation, results)
+            files = [*results.files, *([] if self._folder is None else [self._folder / SUMMARY])]
+            results.summary["notes"] += notes[noted:]
+            noted = len(notes)
+            if self._folder is not None:
+                results.summary["files"] = [str(path) for path in files]
+                write_summary(self._folder / SUMMARY, results.summary)
+        results.files, self.results = files, results
+        if self._error is not None:
+            raise self._error
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _failed(self, error: SimulationError | OutputError) -> RigidMDError:
+        """The error with its step, time and explanation, and how to resume a run that could not write."""
+        part = self._part
+        time, origin = part.state.time
+        step = int(part.state.step[ORIGIN]) + round((time - origin) / part.segment.dt)
+        where = f"stopped at step {step} ({time:g} {part.time_unit}): "
+        if isinstance(error, OutputError):
+            advice = f". Free disk space and resume from the last checkpoint: rigidmd resume {self._folder}"
+            kept = [] if self._folder is None else [self._folder / CHECKPOINT, self._folder / PREVIOUS]
+            return OutputError(f"{where}{error}{advice if any(path.is_file() for path in kept) else ''}")
+        saved = "".join(observer.failed(self._simulation) for observer in self._observers.values())
+        return SimulationError(f"{where}{part.explain(error)}{saved}")
+
+    def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
+        """The checkpoint to resume from, None if the run has to begin, and whether the files of the folder stay."""
+        if is_empty(folder) or never_began(folder):
+            self._simulation.announce(f"{folder} holds no run yet: beginning it")
+            return None, not is_empty(folder)
+        kept, problems = latest(folder)
+        for problem in problems:
+            self._simulation.warn(f"{problem}. The checkpoint before it is used")
+        return kept, True
+
+    def _checkpoint(self) -> None:
+        """Write a checkpoint, if the run has checkpoints and its engine can give its memory as arrays."""
+        part, record = self._part, self._part.record
+        if not self.checkpoints.writes or self._error is not None or (memory := part.engine.memory()) is None:
+            return  # after an error a run that resumes calls the observer again
+        parts = {name: observer.memory() for name, observer in self._observers.items()}
+        parts |= {
+            RECORD: stored(record, record.types()), "engine": Checkpoint({}, memory),
+            "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),
+        }  # fmt: skip
+        arrays = {f"{owner}/{name}": array for owner, kept in parts.items() for name, array in kept.arrays.items()}
+        data = {"with": computed_with(), "of": {owner: kept.values for owner, kept in parts.items()}}
+        position = record.position.segment, int(part.state.step[NOW]), record.position.seconds > 0
+        self.checkpoints.write_once(Checkpoint(data, arrays), position)
+
+    def _run_segments(self, resumed: bool) -> Generator[None]:
+        """Advance through all segments, or from the position of a checkpoint on; pause at step `_until`."""
+        part, position, observers = self._part, self._part.record.position, self._observers.values()
+        for k in range(position.segment, len(part.durations())):
+            if resumed:
+                part.segment = segment = part.reenter_segment(k)
+            else:
+                part.segment = segment = part.enter_segment(k)
+                position.segment, position.first, position.seconds = k, int(part.state.step[NOW]), 0.0
+                if k == 0:
+                    self._notify(self._moment(0), [observer.interval is not None for observer in observers])
+                    self._checkpoint()
+            done, resumed = int(part.state.step[NOW]) - position.first, False
+            schedule = ObservationSchedule(observers, segment)
+            if segment.action is not None:
+                began = clock.perf_counter()
+                segment.action(self._progress)
+                position.seconds = clock.perf_counter() - began
+                due = [observer.interval is not None or observer.ends for observer in observers]
+                self._notify(self._moment(0), due)
+            shown, pace = None, inf
+            self._bar.unpause()
+            while done < segment.steps and not self.interrupted:
+                to = int(min(schedule.next_observation(done), self._until - position.first))
+                if pace > 0:
+                    to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))  # the first step alone, as it may be slow
+                before, shown = shown, schedule.due(to)
+                with_energies = schedule.reads_energies(shown)
+                began = clock.perf_counter()
+                try:
+                    part.engine.advance(part.state, segment.method, segment.dt, position.first + to, with_energies)
+                except Halted:
+                    shown = before
+                    break
+                seconds = clock.perf_counter() - began
+                pace = seconds / (to - done)
+                position.seconds += seconds
+                if not part.is_finite():
+                    raise NotFiniteError(part.state)
+                advance, done = segment.dt * (to - done), to
+                self._notify(self._moment(done), shown)
+                self._bar.update(advance)
+                if not self.must_end() and done < segment.steps and self.checkpoints.is_due:
+                    self._checkpoint()
+                while position.first + done >= self._until and not self.interrupted:
+                    yield
+            if not (segment.action is not None and self.interrupted):
+                self._checkpoint()
+            if done < segment.steps and shown is not None:  # only a run that stops here calls these observers
+                due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
+                self._notify(self._moment(done), due)
+            position.time += done * segment.dt
+            position.computing.append(position.seconds)
+            if self.interrupted:
+                break
+
+    def _moment(self, done: int) -> Moment:
+        """The moment after `done` steps of the present segment."""
+        position = self._part.record.position
+        time = position.time + done * self._part.segment.dt
+        return Moment(self._simulation, position.first + done, time, position.segment)
+
+    def _notify(self, moment: Moment, due: Sequence[bool]) -> None:
+        for observer, now in zip(self._observers.values(), due, strict=True):
+            if now and not (observer.once and self._part.is_replaced(moment)):
+                self._call_observer(observer, observer.see, moment)
+        self._check_process()
+
+    def _call_observer(self, observer: Observer, method: Callable[..., None], *arguments: Any) -> None:
+        """Call a method of an observer, unless the observer has failed before. Its error ends the run, which raises it
+        when all files are complete; an error of a figure becomes a note. `see` may raise the errors of this package."""
+        if observer in self._failed_before:
+            return
+        try:
+            method(*arguments)
+        except Exception as error:  # a user's observer may raise anything
+            if isinstance(error, RigidMDError) and method == observer.see:
+                raise
+            self._failed_before.append(observer)
+            reason, name = f"{type(error).__name__}: {' '.join(str(error).split())}", type(observer).__name__
+            if observer.draws:
+                self._simulation.note(f"{', '.join(observer.files()) or name} cannot be drawn: {reason}")
+                return
+            part = self._part
+            self._simulation.note(f"{name} failed at {part.state.time[NOW]:g} {part.time_unit}: {reason}")
+            self.interrupted, self._error = True, self._error or error
+
+    def must_end(self) -> bool:
+        """Whether the run has to end, by a signal or because its time is up."""
+        if not self.interrupted and self.checkpoints.time_is_up:
+            self.interrupted = self.out_of_time = True
+        return self.interrupted
+
+    def stop(self, number: int | None = None) -> None:
+        """End the run at the next observation, with all files."""
+        self.signal = self.signal or number
+        self.interrupted = True
+
+    def _stop_by_signal(self, number: int) -> None:
+        """Stop; a second Ctrl-C ends the run at once."""
+        if self.interrupted and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.stop(number)
