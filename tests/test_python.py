@@ -409,7 +409,7 @@ def test_a_run_that_nobody_closes_lets_its_folder_go(ends, tmp_path):
 import gc, os, signal, sys
 import rigidmd
 scene = rigidmd.Scene.read({str(TOP)!r}, {SHORT | {"output.trajectory": False}!r})
-simulation = rigidmd.Simulation(scene, "run", observers=[rigidmd.Every(0.001, lambda moment: moment.step == 15 and
+simulation = rigidmd.Simulation(scene, "run", observers=[rigidmd.Every(0.001, lambda moment: moment.step == 16 and
     {ends!r} == "signal" and os.kill(os.getpid(), signal.SIGINT))])
 simulation.step(9)
 if {ends!r} == "deleted":
@@ -420,7 +420,7 @@ elif {ends!r} == "signal":
     try:
         simulation.step(50)
     except KeyboardInterrupt:
-        sys.exit(simulation.state.step[0] >= 15 and os.path.exists("run/summary.json"))
+        sys.exit(simulation.state.step[0] >= 16 and os.path.exists("run/summary.json"))
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (int(ends == "signal"), "")
