@@ -155,49 +155,39 @@ class MolecularRun(RunPart):
             self._check(other)
         else:
             self._remove_overlaps()
-            self._compile()
+            with user_errors_explained(self.system):
+                for k, stage in enumerate(self.scene.stages):
+                    if not (stage.is_auto or stage.is_minimisation):
+                        method = self._integrator(k)
+                        self.engine.advance(self._state_for(method), method, 0.0, 0)
         self.engine.forget()
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
         self.simulation.announce(f"compiling ({describe_cache()})")
-        with user_errors_explained(self.system):
+        system, scene, first = self.system, self.scene, self.scene.stages[0]
+        with user_errors_explained(system):
             _, tallies = self.engine.evaluate(self.state)
         if not all(np.isfinite(tally.energy) for tally in tallies.values()):
-            raise SceneError(
-                self.scene.source, ["the start has no finite energy: sites of different molecules coincide"]
+            raise SceneError(scene.source, ["the start has no finite energy: sites of different molecules coincide"])
+        # At 0 K the scale is the deepest well between two sites.
+        deepest = max((m.epsilon.max() for m in system.species), default=0.0)
+        thermal = BOLTZMANN * (scene.start.temperature_K or 0.0) or deepest
+        if system.from_lattice and not first.is_minimisation and thermal > 0:
+            radius, dt = np.array([m.radius for m in system.species]), first.timestep_fs * FEMTOSECOND
+            removal = self.record.removal = remove_overlaps(
+                system.model, self.engine, self.state, radius, system.smallest_diameter, thermal, dt
             )
-        first = self.scene.stages[0]
-        removal = None
-        if self.system.from_lattice and not first.is_minimisation:
-            radius = np.array([m.radius for m in self.system.species])
-            temperature = self.scene.start.temperature_K or 0.0
-            # At 0 K the scale is the deepest well between two sites.
-            thermal = BOLTZMANN * temperature or max((m.epsilon.max() for m in self.system.species), default=0.0)
-            if thermal > 0:
-                scale = self.system.smallest_diameter
-                dt = first.timestep_fs * FEMTOSECOND
-                removal = remove_overlaps(self.system.model, self.engine, self.state, radius, scale, thermal, dt)
-                if removal.excess > 1:
-                    raise SceneError(
-                        self.scene.source,
-                        [
-                            f"the molecules cannot be packed at {self.system.density:.3g} g/cm³ without overlap: after "
-                            f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
-                            f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
-                            "shorten timestep_fs of the first stage"
-                        ],
-                    )
-        check_forces(self.system, self.state)
+            if removal.excess > 1:
+                problem = (
+                    f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after "
+                    f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
+                    f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
+                    "shorten timestep_fs of the first stage"
+                )
+                raise SceneError(scene.source, [problem])
+        check_forces(system, self.state)
         self.engine.forget()
-        self.record.removal = removal
-
-    def _compile(self) -> None:
-        with user_errors_explained(self.system):
-            for k, stage in enumerate(self.scene.stages):
-                if not (stage.is_auto or stage.is_minimisation):
-                    method = self._integrator(k)
-                    self.engine.advance(self._state_for(method), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
         """The present state, without copies, with the additional variables of an integrator."""
