@@ -96,28 +96,23 @@ class MolecularRun(RunPart):
         return usable_threads(self.scene.threads)
 
     def start_from(self, state: State) -> None:
-        """See `Simulation.start_from`."""
         self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
         self.reset()
 
     def take_threads(self, count: int) -> None:
-        """See `Simulation.take_threads`."""
         self._start = replace(self._start, scene=self._start.scene.model_copy(update={"threads": count}))
         self.reset()
 
     def atoms(self) -> "ase.Atoms":
-        """See `Simulation.atoms`."""
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> OverlapRemoval | None:
-        """See `Simulation.start`."""
         self.reset()
         with interruptible():
             self._remove_overlaps()
         return self.record.removal
 
     def settle(self) -> State:
-        """See `Simulation.settle`."""
         self.start()
         for k, stage in enumerate(self.scene.stages):
             if not stage.is_minimisation:

@@ -191,7 +191,7 @@ class SceneFile(Observer):
 
     def begin(self, run: "Simulation") -> None:
         """Write scene.toml. It is written again after an integrator has been chosen for a stage."""
-        self.resume(run, Checkpoint({}, {}))
+        self._run = run
         self.cut()
 
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:

@@ -112,9 +112,7 @@ class Trial:
     energy_drift: float = np.nan  # per span
     energy_drift_error: float = np.nan
     orthogonality_error: float = np.nan
-    conserved_errors: dict[str, float] = field(
-        default_factory=dict
-    )  # largest relative errors of other conserved quantities
+    conserved_errors: dict[str, float] = field(default_factory=dict)  # largest relative ones, of other quantities
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
     averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
