@@ -53,8 +53,8 @@ def _accuracy(options: argparse.Namespace) -> int:
 
     scene = read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
-    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
+    (lock := FolderLock(folder)).take()
     integrators = options.integrators.split(",") if options.integrators else None
     try:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
@@ -82,8 +82,8 @@ def _averages(
     from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
     from rigidmd.studies.accuracy.averages_report import FILES, bias_conclusions, table_text, write_averages
 
-    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
+    (lock := FolderLock(folder)).take()
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
     with progress_bar("compiling, and running what comes before the last stage") as progress:
         found = measure_averages(scene, methods, timesteps, sample, progress)

@@ -28,8 +28,8 @@ def _stability(options: argparse.Namespace) -> int:
     from rigidmd.studies.stability.stability import run_cases
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
-    (lock := FolderLock(folder)).take()
     check_folder(folder, options.force, names=FILES)
+    (lock := FolderLock(folder)).take()
     with progress_bar() as progress:
         results = list(run_cases(options.case, options.quick, progress))
     print(table_text(results), "", *conclusions(results), sep="\n")
