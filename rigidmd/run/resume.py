@@ -126,7 +126,7 @@ class RunPosition:
 
 @dataclass
 class RunRecord:
-    """What evolves in a run beside its state, its engine and its observers, and the input.
+    """The input of a run and all that evolves in it, besides its state, its engine and its observers.
 
     Every field of this class and its subclasses is in the checkpoints: `stored` and `restored` follow the annotations.
     """
