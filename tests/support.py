@@ -351,7 +351,7 @@ HOMES = {
     "run.checkpoints": "CheckpointSchedule",
     "run.minimise": "minimise",
     "run.overlap_removal": "remove_overlaps",
-    "run.resume": "Arrays RunRecord state_from",
+    "run.resume": "Arrays state_from",
     "run.body": "BodyRecord BodyRun",
     "run.molecular": "MolecularRecord MolecularRun",
     "run.signals": "interruptible",

@@ -33,9 +33,7 @@ from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, P
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.overlap_removal import OverlapRemoval, remove_overlaps
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.shadow import choose_for_averages
 from rigidmd.run.pilot.stable_step import is_estimate_cheap, stable_angle, stiffest_mode
-from rigidmd.run.pilot.trial_systems import choose_for_molecules
 from rigidmd.run.provenance import plain
 from rigidmd.run.quantity_docs import describe_quantities
 from rigidmd.run.report import summary_text
@@ -304,6 +302,9 @@ class MolecularRun(RunPart):
 
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
+        from rigidmd.run.pilot.shadow import choose_for_averages
+        from rigidmd.run.pilot.trial_systems import choose_for_molecules
+
         stage = self.scene.stages[k]
         self.simulation.announce("choosing integrator and step by pilot runs")
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
