@@ -37,5 +37,5 @@ def no_analysis_outlives_its_test():
     """Examples of the documentation register analyses, and a worker runs many files."""
     yield
     registry = sys.modules.get(f"rigidmd.{MODULES['registry']}")
-    for name in set(registry.KNOWN) - set(registry.ORDER) if registry else ():
+    for name in [name for name, entry in registry.KNOWN.items() if entry.is_user] if registry else ():
         del registry.KNOWN[name]

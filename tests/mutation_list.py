@@ -77,7 +77,7 @@ CORE = [
     ),
     Mutation(
         "A9", "viscosity: the differences of normal stresses are not halved",
-        "analysis/shear_viscosity.py",
+        "analysis/built_in/shear_viscosity.py",
         "(xx - yy) / 2, (yy - zz) / 2], axis=1)",
         "(xx - yy), (yy - zz)], axis=1)",
         ("test_analyse.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",),
@@ -98,7 +98,7 @@ CORE = [
     ),
     Mutation(
         "A12", "dielectric constant: <M>² is not taken off",
-        "analysis/permittivity.py",
+        "analysis/built_in/permittivity.py",
         "    off = dipole - dipole.mean(axis=0)",
         "    off = dipole",
         (
@@ -159,28 +159,28 @@ RINGS = [
     ),
     Mutation(
         "B7", "spectra: 33.36 for 29.98 in the wave number",
-        "analysis/rotation.py",
+        "analysis/built_in/rotation.py",
         "PER_CM = 0.0299792458",
         "PER_CM = 0.0333564095",
         ("test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
     ),
     Mutation(
         "B8", "rotational diffusion: rotations about axes of the lab, not of the body",
-        "analysis/rotation.py",
+        "analysis/built_in/rotation.py",
         'between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])',
         'between = np.einsum("fnij,fnkj->fnik", Q[1:], Q[:-1])',
         ("test_mixtures.py::test_an_anisotropic_body_diffuses_about_its_own_axes",),
     ),
     Mutation(
         "B9", "n(r) of a mixture: divided by the number of the other species",
-        "analysis/structure.py",
+        "analysis/built_in/structure.py",
         "len(thinned.sites(a, slice(0, 1))[1])",
         "len(thinned.sites(b, slice(0, 1))[1])",
         ("test_mixtures.py::test_pairs_of_a_mixture_are_counted_against_the_pairs_that_there_are",),
     ),
     Mutation(
         "B10", "spectrum of linear molecules: twice as high",
-        "analysis/rotation.py",
+        "analysis/built_in/rotation.py",
         'found[f"omega {name}"] = moments[2], lambda',
         'found[f"omega {name}"] = 2 * moments[2], lambda',
         ("test_mixtures.py::test_wave_numbers_and_freedoms_of_a_mixture",),
@@ -273,14 +273,14 @@ RINGS = [
     ),
     Mutation(
         "B22", "profile of the density: sites are not rotated with their molecule",
-        "analysis/structure.py",
+        "analysis/built_in/structure.py",
         "                at = at + part.Q[:, kind.index] @ kind.molecule.positions_body[site]",
         "                at = at + kind.molecule.positions_body[site]",
         ("test_mixtures.py::test_the_profile_of_a_mixture_is_that_of_its_rotated_sites",),
     ),
     Mutation(
         "B23", "hydrogen bonds: O-H is not rotated with its molecule",
-        "analysis/structure.py",
+        "analysis/built_in/structure.py",
         "arm.append(np.broadcast_to(rotation @ (body[hydrogen] - body[site]), centre.shape))",
         "arm.append(np.broadcast_to(body[hydrogen] - body[site], centre.shape))",
         ("test_mixtures.py::test_hydrogen_bonds_of_a_mixture_are_those_of_its_geometry",),

@@ -77,13 +77,18 @@ def names(folder):
 
 # the command
 
+BUILT_IN = [
+    "rdf", "structure_factor", "density_profile", "hydrogen_bonds", "msd", "diffusion", "orientation", "spectrum",
+    "dielectric", "viscosity",
+]  # fmt: skip
+
 
 def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     before = names(copy)
     assert cli.main(["analyse", str(copy), "--from", "0.02ps"]) == 0
     text = capsys.readouterr().out
     found = json.loads((copy / "analysis.json").read_text())["analyses"]
-    assert set(found) == set(registry.ORDER)
+    assert list(found) == BUILT_IN
     left_out = [name for name, entry in found.items() if not entry["curves"] and not entry["values"]]
     assert left_out == ["viscosity"]
     assert "viscosity: skipped: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps" in text
@@ -118,7 +123,7 @@ def test_the_list_is_that_of_all(capsys):
         cli.main(["analyse", "--list"])
     assert ended.value.code == 0
     told = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert told == list(registry.ORDER)
+    assert told == BUILT_IN
 
 
 def test_results_in_memory_and_from_the_folder_agree(water):
@@ -486,9 +491,60 @@ def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
     assert words in said(capsys, water, "--trust", tmp_path / "own.py")
 
 
-def test_the_names_of_analyses_are_kept_for_them():
-    registry.selected([])
-    assert {name for name, entry in registry.KNOWN.items() if not entry.is_user} == set(registry.ORDER)
+def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
+    """A file beside the built-in ones: a command, a position, a function of results with its arguments and help."""
+    (tmp_path / "cosines.py").write_text(
+        "from rigidmd.analysis.registry import built_in\n"
+        "from rigidmd.analysis.result import AnalysisResult, Value\n"
+        "@built_in('mean cosine of an axis of the bodies', position=15)\n"
+        "def mean_cosine(frames, axis='z', power=1):\n"
+        "    'Mean of cos(angle)**power to an axis of the box.'\n"
+        "    k = 'xyz'.index(axis)\n"
+        "    found = float((frames.Q[:, :, k, 2] ** power).mean())\n"
+        "    return AnalysisResult('mean_cosine', 'cosine', [Value(axis, '1', found, 0.0)])\n"
+    )
+    monkeypatch.setattr(registry, "KNOWN", registry.KNOWN.copy())
+    monkeypatch.setattr(rigidmd.analysis.built_in, "__path__", [*rigidmd.analysis.built_in.__path__, str(tmp_path)])
+    registry.load_built_in()
+    monkeypatch.delitem(sys.modules, "rigidmd.analysis.built_in.cosines")
+    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
+    found = rigidmd.analysis.mean_cosine(results, "x", power=2, start=0.0)
+    assert found.value("x").value == pytest.approx((results.rotation[:, :, 0, 2] ** 2).mean())
+    assert rigidmd.analysis.analyse(results, "mean_cosine", axis="y").value("y").value != found.value("x").value
+    help(rigidmd.analysis.mean_cosine)
+    said = capsys.readouterr().out
+    assert "mean_cosine(results: " in said and ", axis='z', power=1, *, start: float | None = None)" in said
+    assert "Mean of cos(angle)**power to an axis of the box." in said
+    assert "mean_cosine" in dir(rigidmd.analysis)
+    with pytest.raises(SystemExit):
+        cli.main(["analyse", "--list"])
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()][:2] == ["rdf", "mean_cosine"]
+    assert cli.main(["analyse", str(copy), "--only", "mean_cosine"]) == 0
+    with pytest.raises(OutputError, match="mean_cosine is an analysis of rigidmd; rename your function"):
+        rigidmd.analysis.register(_named("mean_cosine"))
+
+
+def _named(name):
+    def function(frames):
+        return frames.time
+
+    function.__name__ = name
+    return function
+
+
+def test_an_analysis_that_is_registered_is_a_function_of_results():
+    @rigidmd.analysis.register
+    def height_of_all(frames):
+        "mean height (Å)"
+        return frames.positions[:, :, 2].mean(axis=1)
+
+    results = Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT)).run()
+    found = rigidmd.analysis.height_of_all(results, start=0.0)
+    assert len(found["height_of_all"]) == len(results.rotation)
+    assert rigidmd.analysis.height_of_all.__doc__ == "mean height (Å)"
+    assert "height_of_all" in dir(rigidmd.analysis)
+    with pytest.raises(AttributeError, match="no attribute 'height_of_none'"):
+        _ = rigidmd.analysis.height_of_none
 
 
 def test_a_pressure_tensor_needs_a_box():

@@ -4,13 +4,14 @@ import csv
 import re
 from collections.abc import Callable
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from rigidmd.analysis.registry import ORDER, analysis_order, selected
+from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.source import frames_of_folder
@@ -52,7 +53,7 @@ def write_results(
             if new.setdefault(name, result.name) != result.name or owner.get(name, result.name) != result.name:
                 other = new[name] if new[name] != result.name else owner[name]
                 raise OutputError(f"{folder / name} is a file of the analysis {other}; rename {result.name}")
-            known_there = name in owner or (result.name in ORDER and name in marked)
+            known_there = name in owner or (is_built_in(result.name) and name in marked)
             if (folder / name).exists() and not known_there:
                 raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
     add_to_folder(folder, [ANALYSIS, *new])
@@ -236,9 +237,10 @@ def analyse_folder(
     results, failed = [], {}
     for k, entry in enumerate(entries):
         progress(READING + (1 - READING) * k / len(entries), entry.name)
-        more = {"viscosity_mPa_s": request.viscosity} if entry.name == "diffusion" else {}
+        options = {"viscosity_mPa_s": request.viscosity}
+        taken = options.keys() & signature(entry.function).parameters
         try:
-            results.append(entry.function(frames, **more))
+            results.append(entry.function(frames, **{option: options[option] for option in taken}))
         except OutputError as error:
             if request.names:
                 raise OutputError(f"{folder}: {error}") from None

@@ -2,7 +2,11 @@
 
 import runpy
 from collections.abc import Callable, Mapping
+from functools import wraps
+from importlib import import_module
+from math import inf
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,32 +18,40 @@ from rigidmd.core.statistics import correlation_time, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.scene.validation import did_you_mean
 
+Function = Callable[..., AnalysisResult]
+
 
 class Analysis(NamedTuple):
     """A function of frames under its name."""
 
     name: str
     about: str
-    function: Callable[..., AnalysisResult]
+    function: Function
+    position: float  # among all; user-defined ones are at the end
     is_user: bool
 
 
 KNOWN: dict[str, Analysis] = {}
-ORDER = (
-    "rdf", "structure_factor", "density_profile", "hydrogen_bonds", "msd", "diffusion", "orientation", "spectrum",
-    "dielectric", "viscosity",
-)  # fmt: skip
 
 
-def built_in(about: str) -> Callable[[Callable[..., AnalysisResult]], Callable[..., AnalysisResult]]:
+def built_in(
+    about: str, position: float = inf
+) -> Callable[[Callable[..., AnalysisResult]], Callable[..., AnalysisResult]]:
     """Register a built-in analysis under the name of its function."""
 
-    def add(function: Callable[..., AnalysisResult]) -> Callable[..., AnalysisResult]:
-        name = function.__name__
-        KNOWN[name] = Analysis(name, about, function, False)
+    def add(function: Function) -> Function:
+        KNOWN[function.__name__] = Analysis(function.__name__, about, function, position, False)
         return function
 
     return add
+
+
+def load_built_in() -> None:
+    """Import the modules of `analysis/built_in/`, which register their analyses."""
+    from rigidmd.analysis import built_in as folder
+
+    for module in iter_modules(folder.__path__):
+        import_module(f"{folder.__name__}.{module.name}")
 
 
 def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], Any]:
@@ -55,12 +67,17 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     figure are made. The first line of its docstring is the title. Raises OutputError if the name is not free.
     """
     name = getattr(function, "__name__", "")
-    if name in ORDER:
+    if is_built_in(name):
         raise OutputError(f"{name} is an analysis of rigidmd; rename your function")
     if not name.isidentifier():
         raise OutputError(f"an analysis has the name of its function; {name or function!r} is not a name: use def")
     about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
-    KNOWN[name] = Analysis(name, about, lambda frames: _analyse_by_function(name, about, function, frames), True)
+
+    @wraps(function)
+    def analysis(frames: RigidFrames) -> AnalysisResult:
+        return _analyse_by_function(name, about, function, frames)
+
+    KNOWN[name] = Analysis(name, about, analysis, inf, True)
     return function
 
 
@@ -75,9 +92,12 @@ def selected(names: list[str]) -> list[Analysis]:
     return [KNOWN[name] for name in names or known]
 
 
-def analysis_order(name: str) -> int:
-    """The position of an analysis among all: user-defined ones at the end."""
-    return ORDER.index(name) if name in ORDER else len(ORDER)
+def analysis_order(name: str) -> float:
+    return KNOWN[name].position if name in KNOWN else inf
+
+
+def is_built_in(name: str) -> bool:
+    return name in KNOWN and not KNOWN[name].is_user
 
 
 def run_user_file(path: Path) -> None:

@@ -3,11 +3,11 @@
 import numpy as np
 from scipy import optimize
 
+from rigidmd.analysis.built_in.translation import MPA_S
 from rigidmd.analysis.correlation import correlation
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value, describe_so_far
 from rigidmd.analysis.rigid_frames import EVEN, RigidFrames
-from rigidmd.analysis.translation import MPA_S
 from rigidmd.errors import OutputError
 from rigidmd.units import BAR
 
@@ -25,7 +25,7 @@ GROWS = 0.25
 DRAWS = 50
 
 
-@built_in("viscosity from the pressure tensor, by Green and Kubo")
+@built_in("viscosity from the pressure tensor, by Green and Kubo", position=100)
 def viscosity(frames: RigidFrames) -> AnalysisResult:
     """Shear viscosity (mPa s): V/kT times the integral of the correlation of five independent components of the
     pressure tensor (output.pressure_tensor_interval_ps).

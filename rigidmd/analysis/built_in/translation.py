@@ -44,7 +44,7 @@ def _displacements(frames: RigidFrames, kind: Kind, lags: int) -> np.ndarray:
     return squared_displacement(frames.paths[:, kind.index], lags)
 
 
-@built_in("mean squared displacement of the centres of mass")
+@built_in("mean squared displacement of the centres of mass", position=50)
 def msd(frames: RigidFrames) -> AnalysisResult:
     """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth of the frames.
 
@@ -58,14 +58,14 @@ def msd(frames: RigidFrames) -> AnalysisResult:
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
 
-@built_in("diffusion coefficient, with the correction for the size of the box")
+@built_in("diffusion coefficient, with the correction for the size of the box", position=60)
 def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> AnalysisResult:
     """D of each species (1e-9 m²/s) from the slope of its mean squared displacement, and D of an infinite box.
 
     viscosity_mPa_s : for the correction of Yeh and Hummer; default: from the pressure tensor of the run, if any
     Raises OutputError.
     """
-    from rigidmd.analysis.shear_viscosity import viscosity_of
+    from rigidmd.analysis.built_in.shear_viscosity import viscosity_of
 
     if viscosity_mPa_s is not None and not 0 < viscosity_mPa_s < np.inf:
         raise OutputError(f"viscosity_mPa_s must be a number above 0, not {viscosity_mPa_s:g}")

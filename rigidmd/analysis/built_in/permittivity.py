@@ -25,7 +25,7 @@ def total_dipole(frames: RigidFrames) -> np.ndarray:
     return total
 
 
-@built_in("dielectric constant from the fluctuation of the total dipole")
+@built_in("dielectric constant from the fluctuation of the total dipole", position=90)
 def dielectric(frames: RigidFrames) -> AnalysisResult:
     """The static dielectric constant, with the boundary condition of the scene: tin foil or a permittivity around the
     sphere of Ewald sums or the cavity of a reaction field (Neumann 1983, Mol. Phys. 50, 841). Raises OutputError."""

@@ -27,7 +27,7 @@ BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
 BONDING = ("N", "O", "F")
 
 
-@built_in("radial distribution functions g(r) of sites of different molecules")
+@built_in("radial distribution functions g(r) of sites of different molecules", position=10)
 def rdf(
     frames: RigidFrames, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
 ) -> AnalysisResult:
@@ -177,7 +177,7 @@ def _first_top(g: np.ndarray) -> int:
     return top
 
 
-@built_in("structure factor S(k) of the centres of mass")
+@built_in("structure factor S(k) of the centres of mass", position=20)
 def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX) -> AnalysisResult:
     """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box; without a name, of the
     centres of all molecules. largest : 1/Å. Raises OutputError."""
@@ -239,7 +239,7 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
     return vectors[chosen], bin_of[chosen]
 
 
-@built_in("profile of the density along an axis of the box")
+@built_in("profile of the density along an axis of the box", position=30)
 def density_profile(frames: RigidFrames, axis: str = "z", bins: int = 100) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c. Raises OutputError."""
     if axis not in ("x", "y", "z"):
@@ -270,7 +270,7 @@ def density_profile(frames: RigidFrames, axis: str = "z", bins: int = 100) -> An
     return AnalysisResult("density_profile", f"density along {axis}", curves=[curve])
 
 
-@built_in("hydrogen bonds for each molecule, by distances and angles")
+@built_in("hydrogen bonds for each molecule, by distances and angles", position=40)
 def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE) -> AnalysisResult:
     """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F) closer than `distance`
     (Å), with an angle to the bond of the hydrogen below `angle` (degrees). Raises OutputError."""

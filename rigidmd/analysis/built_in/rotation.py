@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
+from rigidmd.analysis.built_in.translation import interval_and_lags
 from rigidmd.analysis.correlation import correlation, squared_displacement
 from rigidmd.analysis.registry import built_in
 from rigidmd.analysis.result import (
@@ -19,7 +20,6 @@ from rigidmd.analysis.result import (
     with_group_error,
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.analysis.translation import interval_and_lags
 from rigidmd.errors import OutputError
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
@@ -50,7 +50,7 @@ def _axes(kind: Kind) -> list[int]:
     return [0] if rotational_freedom(kind.molecule.kind) == 2 else [0, 1, 2]
 
 
-@built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion")
+@built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion", position=70)
 def orientation(frames: RigidFrames) -> AnalysisResult:
     """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational diffusion (1/ps).
 
@@ -172,7 +172,7 @@ def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags
     ]
 
 
-@built_in("spectra and correlations of velocities, angular velocities and angular momenta")
+@built_in("spectra and correlations of velocities, angular velocities and angular momenta", position=80)
 def spectrum(frames: RigidFrames) -> AnalysisResult:
     """Densities of states (cm) of translation and of rotation about each body axis, from the power of velocities and
     angular velocities, and their correlation functions. The integral over wave numbers is the number of degrees of
