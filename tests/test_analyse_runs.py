@@ -494,8 +494,8 @@ def test_a_file_of_ones_own_that_is_wrong(text, words, water, tmp_path, capsys):
 def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
     """A file beside the built-in ones: a command, a position, a function of results with its arguments and help."""
     (tmp_path / "cosines.py").write_text(
-        "from rigidmd.analysis.registry import built_in\n"
-        "from rigidmd.analysis.result import AnalysisResult, Value\n"
+        f"from {registry.__name__} import built_in\n"
+        f"from {registry.AnalysisResult.__module__} import AnalysisResult, Value\n"
         "@built_in('mean cosine of an axis of the bodies', position=15)\n"
         "def mean_cosine(frames, axis='z', power=1):\n"
         "    'Mean of cos(angle)**power to an axis of the box.'\n"

@@ -86,13 +86,12 @@ class Log(AppendedFile):
 
 
 TENSOR_FILE = "pressure_tensor.csv"
-COMPONENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
-HEADER = ["Time (ps)", *(f"Pressure {name} (bar)" for name in COMPONENTS)]
+HEADER = [samples.COLUMNS[name].header for name in ("time", *TENSOR)]
 
 
-def tensor_row(time: float, tensor: np.ndarray) -> list[float]:
-    """A line of pressure_tensor.csv: time (ps) and six components of a symmetric tensor (3, 3), bar."""
-    return [round(time, 9), *(float(tensor["xyz".index(a), "xyz".index(b)]) for a, b in COMPONENTS)]
+def tensor_row(sample: Sample) -> list[float]:
+    """A line of pressure_tensor.csv: time (ps) and the six components of the tensor, bar."""
+    return [round(sample.time, 9), *(getattr(sample, name) for name in TENSOR)]
 
 
 class TensorFile(AppendedFile):

@@ -190,4 +190,5 @@ def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
 
 
 def _cross(x: np.ndarray) -> np.ndarray:
-    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
+    """The matrix (3, 3) of the product x x f."""
+    return np.cross(np.eye(3), x)

@@ -60,7 +60,7 @@ class PressureTensor(GrowingFile):
         self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE), self.kept)
 
     def see(self, moment: Moment) -> None:
-        row = tensor_row(moment.time, moment.observation.pressure_tensor_bar)
+        row = tensor_row(moment.sample)
         if self._file is None:
             self._rows.append(row)
         else:

@@ -70,10 +70,9 @@ class Record:
     @property
     def moving(self) -> np.ndarray:
         """Which samples (t,) are not of minimisations, in which no time passes."""
-        stages = getattr(self.scene, "stages", ())
-        return np.array(
-            [not (stages and stages[k].is_minimisation) for k in self.columns.get("stage", self.time)], bool
-        )
+        if isinstance(self.scene, BodyScene):
+            return np.ones(len(self.time), bool)
+        return samples.moving(self.scene.stages, self.columns["stage"])
 
     @property
     def trajectory(self) -> Path:

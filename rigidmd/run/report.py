@@ -2,13 +2,9 @@
 
 from collections.abc import Container
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rigidmd.io.write import write_json
-
-if TYPE_CHECKING:
-    pass
 from rigidmd.core.statistics import NO_ERROR, format_signed
+from rigidmd.io.write import write_json
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
@@ -32,31 +28,32 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
     ]
     for stage in summary["stages"]:
         lines += ["", stage_title(stage)]
-        lines += [f"  {name:<16}{value}" for name, value in stage_rows(stage)]
-    lines += ["", f"  {'orthogonality':<16}|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"]
-    lines.append(
-        f"  {'momentum':<16}|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, "
-        f"{summary['momentum_relative']:.1e} of the sum of |m v|"
-    )
+        lines += _as_lines(stage_rows(stage))
+    momentum = f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the sum of |m v|"
+    rows = [_orthogonality(summary), ("momentum", momentum)]
     if removed := summary["momentum_removed"]:
-        lines.append(
-            f"  {'':<16}removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"
-        )
+        rows.append(("", f"removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"))
     if summary["positions"]:
-        lines.append(f"  {'positions':<16}{summary['positions']}: {POSITIONS[summary['positions']]}")
-    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
-    if summary["interrupted"]:
-        lines += ["", "  interrupted: these are the results so far"]
-    return "\n".join(lines)
+        rows.append(("positions", f"{summary['positions']}: {POSITIONS[summary['positions']]}"))
+    return "\n".join([*lines, "", *_as_lines(rows), *_last_lines(summary, known)])
 
 
 def body_summary_text(summary: dict, known: Container[str] = ()) -> str:
     """The summary of a run of a single body as text, without the notes in `known`."""
-    lines = [f"\n{body_title(summary)}", *(f"  {name:<16}{value}" for name, value in body_rows(summary))]
-    lines += [f"\n  note: {note}" for note in summary["notes"] if note not in known]
-    if summary["interrupted"]:
-        lines += ["", "  interrupted: these are the results so far"]
-    return "\n".join(lines)
+    return "\n".join([f"\n{body_title(summary)}", *_as_lines(body_rows(summary)), *_last_lines(summary, known)])
+
+
+def _as_lines(rows: list[tuple[str, str]]) -> list[str]:
+    return [f"  {name:<16}{value}" for name, value in rows]
+
+
+def _last_lines(summary: dict, known: Container[str]) -> list[str]:
+    notes = [f"\n  note: {note}" for note in summary["notes"] if note not in known]
+    return [*notes, *(["", "  interrupted: these are the results so far"] if summary["interrupted"] else [])]
+
+
+def _orthogonality(summary: dict) -> tuple[str, str]:
+    return "orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"
 
 
 def body_title(summary: dict) -> str:
@@ -77,7 +74,7 @@ def body_rows(summary: dict) -> list[tuple[str, str]]:
         of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
         rows.append((f"{name} error", f"at most {error:.1e} of {of}"))
     if summary["largest_orthogonality_error"] is not None:
-        rows.append(("orthogonality", f"|QᵀQ - 1| at most {summary['largest_orthogonality_error']:.1e}"))
+        rows.append(_orthogonality(summary))
     return rows
 
 
@@ -138,12 +135,10 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
-            rows.append(
-                ("", f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total")
-            )
-        rows.append(
-            ("energy noise", f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule, rms about the line")
-        )
+            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations"
+            rows.append(("", f"{deviations} of the kinetic energy in total"))
+        noise = f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule"
+        rows.append(("energy noise", f"{noise}, rms about the line"))
     return rows
 
 
@@ -153,8 +148,6 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
 
 
 def _temperatures(stage: dict, suffix: str) -> str:
-    values = (
-        ("T_trans", stage[f"temperature_translation_{suffix}"]),
-        ("T_rot", stage[f"temperature_rotation_{suffix}"]),
-    )
+    motions = (("T_trans", "translation"), ("T_rot", "rotation"))
+    values = [(name, stage[f"temperature_{motion}_{suffix}"]) for name, motion in motions]
     return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)

@@ -69,6 +69,7 @@ def summarise(
     scene = system.scene
     last = samples.row(-1)
     size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))  # sum of |m v|
+    moving = [k for k in range(len(times.computing)) if k not in minima]
     stages = [
         (
             _stage(system, samples, k, times.computing[k], moves.get(k, (0, 0)))
@@ -82,40 +83,24 @@ def summarise(
         for k in np.unique(samples["stage"]).tolist()
     ]
     return {
-        "interrupted": interrupted,
-        "molecules": len(system.model.species),
+        "interrupted": interrupted, "molecules": len(system.model.species),
         "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
-        "sites": system.site_count,
-        "degrees_of_freedom": system.last_freedom.total,
+        "sites": system.site_count, "degrees_of_freedom": system.last_freedom.total,
         "degrees_of_freedom_translation": system.last_freedom.translation,
         "degrees_of_freedom_rotation": system.last_freedom.rotation,
-        "box_A": list(system.space) if system.density else None,
-        "density_g_cm3": system.density or None,
+        "box_A": list(system.space) if system.density else None, "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
-        "relief_steps": overlap_steps,
-        "preparing_s": times.preparing,
-        "wall_s": times.wall,
-        "largest_orthogonality_error": float(samples["orthogonality_error"].max()),
-        "momentum_u_A_ps": last.momentum,
+        "relief_steps": overlap_steps, "preparing_s": times.preparing, "wall_s": times.wall,
+        "largest_orthogonality_error": float(samples["orthogonality_error"].max()), "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
-        "own_forces": dict(system.user_terms),
-        "momentum_removed": _momentum_removed(system, state),
-        "stages": stages,
+        "own_forces": dict(system.user_terms), "momentum_removed": _momentum_removed(system, state), "stages": stages,
         "notes": [
-            *system.notes,
-            *_common_drift_notes(system, state, last),
-            *ewald_error_notes(system, state),
-            *(
-                n
-                for k in range(len(times.computing))
-                if k not in minima
-                for n in _notes_on_averages(system, samples, k)
-            ),
-            *warnings,
+            *system.notes, *_common_drift_notes(system, state, last), *ewald_error_notes(system, state),
+            *(note for k in moving for note in _notes_on_averages(system, samples, k)), *warnings,
         ],
-    }
+    }  # fmt: skip
 
 
 def _choice(system: System, samples: Samples, k: int, text: str | None) -> str | None:
@@ -238,44 +223,27 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
     line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
-    mean_t, error_t = mean_and_error(of_stage["temperature"])
-    spread = float(of_stage["kinetic"].std())
-    per_molecule = line.value * 1000 / n
-    thermal = BOLTZMANN / KJ_PER_MOL * (mean_t or 0.0) * system.freedom_in(k).total
-    per_kt = line.value * 1000 / thermal if thermal > 0 else None
-    error_kt = line.error * 1000 / thermal if thermal > 0 else None
+    motions = [f"temperature_{motion}{kind}" for kind in ("", "_unbiased") for motion in MOTIONS]
+    means = {name: mean_and_error(of_stage[name]) for name in ("temperature", *motions, "pressure_bar")}
+    temperature, pressure = means["temperature"], means["pressure_bar"]
+    spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
+    thermal = BOLTZMANN / KJ_PER_MOL * (temperature[0] or 0.0) * system.freedom_in(k).total
+    per_kt = [_finite_or_none(rate * 1000 / thermal) if thermal > 0 else None for rate in line[:2]]
     return {
-        "name": stage.label,
-        "ensemble": stage.ensemble,
-        "integrator": stage.integrator,
-        "timestep_fs": stage.timestep_fs,
-        "steps": steps,
-        "duration_ps": steps * stage.timestep_fs * FEMTOSECOND,
-        "computing_s": computing,
-        "steps_per_s": speed,
-        "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
-        "temperature_K": mean_t,
-        "temperature_error_K": error_t,
-        "temperature_translation_K": mean_and_error(of_stage["temperature_translation"])[0],
-        "temperature_rotation_K": mean_and_error(of_stage["temperature_rotation"])[0],
-        "temperature_translation_unbiased_K": mean_and_error(of_stage["temperature_translation_unbiased"])[0],
-        "temperature_rotation_unbiased_K": mean_and_error(of_stage["temperature_rotation_unbiased"])[0],
+        "name": stage.label, "ensemble": stage.ensemble, "integrator": stage.integrator,
+        "timestep_fs": stage.timestep_fs, "steps": steps, "duration_ps": duration, "computing_s": computing,
+        "steps_per_s": speed, "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "temperature_K": temperature[0], "temperature_error_K": temperature[1],
+        **{f"{name}_K": means[name][0] for name in motions},
         "potential_kJ_mol_per_molecule": float(np.mean(of_stage["potential"])) / n,
-        "pressure_bar": mean_and_error(of_stage["pressure_bar"])[0],
-        "pressure_error_bar": mean_and_error(of_stage["pressure_bar"])[1],
-        **(_box_means(of_stage) if stage.has_barostat else {}),
-        "moves_tried": moves[0],
-        "moves_accepted": moves[1],
-        "drift_kJ_mol_ns_per_molecule": _finite_or_none(per_molecule),
+        "pressure_bar": pressure[0], "pressure_error_bar": pressure[1],
+        **(_box_means(of_stage) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
+        "drift_kJ_mol_ns_per_molecule": _finite_or_none(line.value * 1000 / n),
         "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
-        "drift_kT_ns_per_degree_of_freedom": per_kt and _finite_or_none(per_kt),
-        "drift_error_kT_ns_per_degree_of_freedom": error_kt and _finite_or_none(error_kt),
-        "drift_over_kinetic_std": _finite_or_none(line.value * steps * stage.timestep_fs * FEMTOSECOND / spread)
-        if spread
-        else None,
-        "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n),
-        "minimum": None,
-    }
+        "drift_kT_ns_per_degree_of_freedom": per_kt[0], "drift_error_kT_ns_per_degree_of_freedom": per_kt[1],
+        "drift_over_kinetic_std": _finite_or_none(line.value * duration / spread) if spread else None,
+        "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n), "minimum": None,
+    }  # fmt: skip
 
 
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
@@ -308,18 +276,15 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
     """The values of a minimum with units in their keys. Pressures are without the kinetic part; None without a box."""
     pressure = None if found.pressure is None else np.array(found.pressure) / BAR
     return {
-        "converged": found.converged,
-        "ended_by": found.ended_by or None,
-        "iterations": found.iterations,
+        "converged": found.converged, "ended_by": found.ended_by or None, "iterations": found.iterations,
         "relief_steps": found.overlap_steps,
         "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
         "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
-        "largest_force_kJ_mol_A": found.force / KJ_PER_MOL,
-        "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
+        "largest_force_kJ_mol_A": found.force / KJ_PER_MOL, "largest_torque_kJ_mol": found.torque / KJ_PER_MOL,
         "pressure_bar": float(pressure[:3].mean()) if pressure is not None else None,
         "pressure_tensor_bar": pressure.tolist() if pressure is not None else None,
         "largest_pressure_deviation_bar": None if found.deviation is None else found.deviation / BAR,
-    }
+    }  # fmt: skip
 
 
 def describe_minimum(found: Minimum, stage: Stage) -> str:
@@ -341,34 +306,20 @@ def summarise_body(system: BodySystem, motion: Motion, planned: int, times: RunT
     run, computing = system.scene.run, sum(times.computing)
     end = float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
+    angles = np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist() if system.rotates else None
     return {
-        "interrupted": interrupted,
-        "kind": system.kind,
-        "pinned": not system.translates,
-        "degrees_of_freedom": system.degrees_of_freedom,
-        "mass_kg": system.mass,
-        "inertia_kg_m2": system.inertia.tolist(),
-        "integrator": run.integrator,
-        "formulation": getattr(system.method, "formulation", None),
-        "timestep_s": run.timestep_s,
-        "steps": steps,
-        "duration_s": end,
-        "samples": len(motion["time"]),
-        "preparing_s": times.preparing,
-        "wall_s": times.wall,
-        "computing_s": computing,
-        "steps_per_s": steps / computing if computing > 0 else None,
-        "energy_start_J": float(motion["energy"][0]),
-        "energy_end_J": float(motion["energy"][-1]),
+        "interrupted": interrupted, "kind": system.kind, "pinned": not system.translates,
+        "degrees_of_freedom": system.degrees_of_freedom, "mass_kg": system.mass,
+        "inertia_kg_m2": system.inertia.tolist(), "integrator": run.integrator,
+        "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
+        "duration_s": end, "samples": len(motion), "preparing_s": times.preparing, "wall_s": times.wall,
+        "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
+        "energy_start_J": float(motion["energy"][0]), "energy_end_J": float(motion["energy"][-1]),
         "work_J": float(motion["work"][-1]),
         "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
         "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
-        "theta_range_deg": np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist()
-        if system.rotates
-        else None,
-        "trajectory_A_per_m": system.scale,
-        "notes": _body_notes(system, motion),
-    }
+        "theta_range_deg": angles, "trajectory_A_per_m": system.scale, "notes": _body_notes(system, motion),
+    }  # fmt: skip
 
 
 def _body_notes(system: BodySystem, motion: Motion) -> list[str]:
