@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rigidmd.run import Every, Moment, Observer, Results, Simulation, run_together
     from rigidmd.scene import BodyScene, MolecularScene, Scene
     from rigidmd.studies.sweep.sweeping import sweep
-    from rigidmd.view.live import LivePlot
+    from rigidmd.view.plots import LivePlot
 
     __version__: str
 

@@ -405,7 +405,7 @@ MODULES = {
     "lammps": "engines.lammps.engine",
     "lammps_files": "engines.lammps.files",
     "lanes": "compile.simd",
-    "live_plot": "view.live",
+    "live_plot": "view.plots",
     "log": "io.log",
     "measuring": "run.pilot.trials",
     "memory": "core.process",

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidmd.core.files import atomic_file
+from rigidmd.engines.body_motion import Motion, drawn_axis
+from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import (
     COOL,
     FAINT,
@@ -20,6 +22,8 @@ from rigidmd.figures.style import (
     settings,
     thin_series,
 )
+from rigidmd.forces.body.frame import InertialFrame
+from rigidmd.mechanics.free_rotor import SplitRotor
 
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
@@ -45,38 +49,39 @@ def draw_motion(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
     return written
 
 
-def motion_figures(
-    name: str, columns: dict[str, np.ndarray], axis_body: np.ndarray, inertia: np.ndarray | None, invariants: list[str],
-    gravity: np.ndarray | None, translates: bool,
-) -> dict[str, "Picture"]:  # fmt: skip
-    """The figures of FIGURES that these columns allow, under a title with the name of the run.
-
-    inertia : of a body whose omega stays on the ellipsoids of energy and momentum, or None
-    translates : whether the body is not pinned: the path of its centre of mass is then a figure
-    """
-    down = None if gravity is None or not np.any(gravity) else np.asarray(gravity) / np.linalg.norm(gravity)
-    figures = {}
-    if len(columns["time"]) > 1:
-        if "q11" in columns:
-            figures["axis"] = _axis_figure(columns, np.asarray(axis_body, float), down)
-        if "phi" in columns:
-            figures["angles"] = _angles_figure(columns)
-        if "omega_body_1" in columns:
-            if inertia is not None and np.min(inertia) > 0:
-                figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(inertia, float))
-            else:
-                figures["omega"] = _omega_figure(columns)
-        if translates:
-            figures["path"] = _path_figure(columns, down)
-        figures["invariants"] = _invariants_figure(columns, invariants)
+def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
+    """The figures of FIGURES that the columns allow, under a title with the name of the run; none for two samples."""
+    if len(samples) <= 2:
+        return {}
+    columns, gravity, figures = dict(samples.columns), system.scene.gravity, {}
+    if system.rotates:  # omega along the principal axes, where it lies on ellipsoids
+        omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
+        columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
+    down = None
+    if gravity is not None and np.any(gravity.acceleration_m_s2):
+        down = np.array(gravity.acceleration_m_s2) / np.linalg.norm(gravity.acceleration_m_s2)
+    if "q11" in columns:
+        figures["axis"] = _axis_figure(columns, np.asarray(drawn_axis(system), float), down)
+    if "phi" in columns:
+        figures["angles"] = _angles_figure(columns)
+    if "omega_body_1" in columns:
+        # omega stays on ellipsoids if the inertia is constant, the frame does not rotate, and no torque acts
+        steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
+        if steady and "L_size" in samples.invariants and np.min(system.inertia) > 0:
+            figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(system.inertia, float))
+        else:
+            figures["omega"] = _omega_figure(columns)
+    if system.translates:
+        figures["path"] = _path_figure(columns, down)
+    figures["invariants"] = _invariants_figure(columns, samples.invariants)
     figures = {stem: figure for stem, figure in figures.items() if figure is not None}
     for figure in figures.values():
-        figure.suptitle(f"{name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
+        figure.suptitle(f"{system.scene.name}: {figure.get_suptitle()}", color=INK, x=0.01, ha="left", fontsize=11)
     return figures
 
 
 def _new_figure(title: str, width: float, height: float):
-    """An empty figure, to whose title `motion_figures` adds the name of the run."""
+    """An empty figure, to whose title `body_figures` adds the name of the run."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
     figure = Picture(figsize=(width, height), layout="constrained")

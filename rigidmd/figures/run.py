@@ -5,14 +5,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.engines.body_motion import Motion, drawn_axis
+from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
 from rigidmd.engines.system import System
-from rigidmd.figures.body import motion_figures
+from rigidmd.figures.body import body_figures
 from rigidmd.figures.style import COOL, FAINT, INK, WARM, shown_range, thin_series
-from rigidmd.forces.body.frame import InertialFrame
-from rigidmd.mechanics.free_rotor import SplitRotor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,24 +27,6 @@ def run_figures(
     if isinstance(samples, Samples) and moving(system.scene.stages, samples["stage"]).sum() > 1:
         return {"energy": energy_figure(system, samples, summary)}
     return {}
-
-
-def body_figures(system: BodySystem, samples: Motion) -> "dict[str, Picture]":
-    """Figures of the axis, angles, omega, path and errors; none for fewer than three samples."""
-    if len(samples) <= 2:
-        return {}
-    columns = dict(samples.columns)
-    if system.rotates:  # omega along the principal axes, where it lies on ellipsoids
-        omega = np.stack([samples[f"omega_body_{k}"] for k in (1, 2, 3)], axis=-1) @ system.axes
-        columns |= {f"omega_body_{k + 1}": omega[:, k] for k in range(3)}
-    # omega stays on ellipsoids if the inertia is constant, the frame does not rotate, and no torque acts
-    steady = isinstance(system.body.rotor, SplitRotor) and isinstance(system.body.frame, InertialFrame)
-    gravity = system.scene.gravity and system.scene.gravity.acceleration_m_s2
-    return motion_figures(
-        system.scene.name, columns=columns, axis_body=drawn_axis(system),
-        inertia=system.inertia if steady and "L_size" in samples.invariants else None, invariants=samples.invariants,
-        gravity=None if gravity is None else np.array(gravity), translates=system.translates,
-    )  # fmt: skip
 
 
 #: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.

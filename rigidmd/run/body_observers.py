@@ -6,8 +6,7 @@ import numpy as np
 
 from rigidmd.core.state import NOW, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
-from rigidmd.figures.body import FIGURES, draw_motion
-from rigidmd.figures.run import body_figures
+from rigidmd.figures.body import FIGURES, body_figures, draw_motion
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz

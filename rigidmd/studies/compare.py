@@ -1,6 +1,6 @@
 """`rigidmd compare`: where two runs diverge, and how their inputs and versions differ."""
 
-import hashlib
+import filecmp
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -127,7 +127,11 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
     time = next((name for name in TIMES if name in columns), None)
     if time is None:
         raise OutputError(f"{file}: no column of times")
-    clock = STEP if STEP in columns and _same_times(first, second, time) else time
+    clock = time
+    if STEP in columns:
+        times = dict(zip(second[STEP], second[time], strict=True))
+        if all(times.get(step, value) == value for step, value in zip(first[STEP], first[time], strict=True)):
+            clock = STEP
     for columns_of in (one, other):
         columns_of.numbers(clock)
     lengths = len(first[clock]), len(second[clock])
@@ -136,18 +140,12 @@ def _compare_samples(file: str, one: Columns, other: Columns) -> SampleCompariso
     found = SampleComparison(file, lengths, len(rows), clock, only=only)
     compared = [name for name in columns if name != STEP or clock == STEP]
     for index, (i, j) in enumerate(rows):
-        unlike = [
-            _difference(name, first[name][i], second[name][j]) for name in compared if first[name][i] != second[name][j]
-        ]
+        pairs = [(name, first[name][i], second[name][j]) for name in compared]
+        unlike = [CellDifference(name, a, b, last_bits(a, b)) for name, a, b in pairs if a != b]
         if unlike and found.at is None:
             found.at, found.index, found.first = first[clock][i], index, unlike
         found.last = unlike
     return found
-
-
-def _same_times(first: dict[str, list[str]], second: dict[str, list[str]], time: str) -> bool:
-    times = dict(zip(second[STEP], second[time], strict=True))
-    return all(times.get(step, value) == value for step, value in zip(first[STEP], first[time], strict=True))
 
 
 def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
@@ -161,16 +159,16 @@ def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
     return rows
 
 
-def _difference(column: str, first: str, second: str) -> CellDifference:
+def last_bits(first: str, second: str) -> int | None:
+    """Number of the last bits of two numbers that differ: bits of the count of floats between them, at most 53.
+
+    None if one is no number.
+    """
     try:
-        return CellDifference(column, first, second, last_bits(float(first), float(second)))
+        numbers = np.array([float(first), float(second)]).view(np.int64)
     except ValueError:
-        return CellDifference(column, first, second, None)
-
-
-def last_bits(a: float, b: float) -> int:
-    """Number of the last bits of two numbers that differ: bits of the count of floats between them, at most 53."""
-    ordered = [int(x) if x >= 0 else -(int(x) & (2**63 - 1)) for x in np.array([a, b]).view(np.int64)]
+        return None
+    ordered = [int(x) if x >= 0 else -(int(x) & (2**63 - 1)) for x in numbers]
     return min(abs(ordered[0] - ordered[1]).bit_length(), BITS)
 
 
@@ -194,26 +192,21 @@ def _compare_bytes(first: Path, second: Path, found: RunComparison) -> None:
     if missing := [f"{path}: {reason}" for path in (first, second) if (reason := unreadable_reason(path))]:
         found.missing += missing
         return
-    digests = []
-    for path in (first, second):
-        with path.open("rb") as file:
-            digests.append(hashlib.file_digest(file, "sha256").digest())
-    found.files[first.name] = digests[0] == digests[1]
+    found.files[first.name] = filecmp.cmp(first, second, shallow=False)
 
 
 def describe_run_comparison(found: RunComparison) -> str:
     one, other = found.folders
-    rows = [("scene", _pairs(found.scene) or ["the same"])]
-    rows += [("made with", _pairs(found.made) or ["the same"])]
+    rows = [
+        (name, [f"{key}: {a} and {b}" for key, (a, b) in unlike.items()] or ["the same"])
+        for name, unlike in (("scene", found.scene), ("made with", found.made))
+    ]
     if found.samples is not None:
         rows.append((found.samples.file, _describe_samples(found.samples)))
     rows += [(name, ["the same bytes" if same else "other bytes"]) for name, same in found.files.items()]
     if found.state:
-        unlike = [
-            f"{name} in shape" if value is None else f"{name} by up to {value:.3g}"
-            for name, value in found.state.items()
-        ]
-        rows.append((FINAL, [f"differs: {', '.join(unlike)} (u, Å, ps)"]))
+        by = {name: "in shape" if value is None else f"by up to {value:.3g}" for name, value in found.state.items()}
+        rows.append((FINAL, [f"differs: {', '.join(f'{name} {how}' for name, how in by.items())} (u, Å, ps)"]))
     elif found.samples is not None and found.samples.file == LOG and not any(FINAL in text for text in found.missing):
         rows.append((FINAL, ["the same to the last bit"]))
     rows += [("missing", [text]) for text in found.missing]
@@ -233,10 +226,6 @@ def _verdict(found: RunComparison) -> str:
     if samples is not None and samples.lengths != (samples.common, samples.common):
         return "the runs are the same to the last bit as far as both have samples"
     return "the runs are not the same"
-
-
-def _pairs(unlike: dict[str, tuple]) -> list[str]:
-    return [f"{key}: {a} and {b}" for key, (a, b) in unlike.items()]
 
 
 def _describe_samples(samples: SampleComparison) -> list[str]:
