@@ -5,18 +5,7 @@ import html
 import numpy as np
 
 from rigidmd.engines.body_motion import drawn_axis
-from rigidmd.figures.style import (
-    COOL,
-    FAINT,
-    INK,
-    UP,
-    WARM,
-    camera,
-    draw_front_and_back,
-    draw_scale,
-    globe,
-    thin_path,
-)
+from rigidmd.figures.style import COOL, FAINT, INK, UP, WARM, camera, draw_front_and_back, draw_scale, globe, thin_path
 from rigidmd.mechanics.rotation import from_quaternion
 from rigidmd.run.record import Record
 from rigidmd.view.mesh import mesh_of
