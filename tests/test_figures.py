@@ -26,7 +26,6 @@ from support import (
     body_trial_system,
     build,
     columns_figure,
-    draw_molecule,
     draw_panel,
     energy_figure,
     load_model,
@@ -35,9 +34,10 @@ from support import (
     save_figure,
     shown_range,
     small_scene,
+    write_molecule_figure,
 )
 from support import SAMPLE_NUMBERS as NUMBERS
-from support import draw_analysis_curve as drawn
+from support import analysis_curve_figure as drawn
 
 from rigidmd.scene import Scene
 
@@ -113,7 +113,7 @@ def test_figures_of_a_run_and_of_a_molecule_take_any_name(name, staged, tmp_path
         save_figure(figure, io.BytesIO(), format="png")
     molecule = load_model("spce")
     own = replace(molecule, name=name, title=name, source=name, site_names=(name,) * 3)
-    draw_molecule(tmp_path / "own.png", own, force=False)
+    write_molecule_figure(tmp_path / "own.png", own, force=False)
 
 
 STAGES = ["minimise", "equilibration", "a short one", "another", "quench", "production at 300 K"]
@@ -198,7 +198,7 @@ def test_as_many_integrators_as_there_are_are_told_apart():
         for n, name in enumerate(names)
         for k in (1, 2, 3)
     ]
-    figure = accuracy_report.figure_of(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
+    figure = accuracy_report.accuracy_figure(IntegratorAccuracy(trial_system, trials, 10, 1e-30))
     for axis in figure.axes:
         curves = [line for line in axis.lines if line.get_label() in names]
         assert [line.get_label() for line in curves] == names

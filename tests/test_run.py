@@ -997,7 +997,7 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
         raise ValueError("ParseException: no mathematics")
 
     monkeypatch.setattr(molecular_observers, "save_figure", fail)
-    monkeypatch.setattr(body_observers, "draw_motion", fail)
+    monkeypatch.setattr(body_observers, "write_motion_figures", fail)
     pictures = [Failing("see", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
@@ -1015,12 +1015,12 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
 
 
 def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
-    def fails_first(folder, figures, draw=body_observers.draw_motion):
+    def fails_first(folder, figures, draw=body_observers.write_motion_figures):
         if "axis" in figures:
             raise ValueError("no axis")
         return draw(folder, figures)
 
-    monkeypatch.setattr(body_observers, "draw_motion", fails_first)
+    monkeypatch.setattr(body_observers, "write_motion_figures", fails_first)
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001})
     results = Simulation(scene, tmp_path / "out", warn=str).run()
     assert {path.name for path in results.files} >= {"angles.png", "omega.png", "summary.json"}

@@ -19,9 +19,9 @@ from support import (
     run_cases,
     selected_cases,
 )
+from support import stability_case_figure as case_figure
 from support import stability_conclusions as conclusions
 from support import stability_failed as has_failed
-from support import stability_picture as picture
 from support import stability_table as table_text
 
 from rigidmd.commands.cli import main
@@ -162,10 +162,10 @@ def test_what_was_refused_far_away_does_not_stretch_a_figure():
     result = CaseResult("made_up", 1, "A case", "x", "error")
     for x in (1.0, 10.0, 1e300):
         result.add("once", Outcome(1e-9, 0.0) if x < 1e9 else Outcome(message="too far"), x, "a family", x)
-    assert picture(result).axes[0].get_xlim()[1] < 1e9
+    assert case_figure(result).axes[0].get_xlim()[1] < 1e9
 
 
 def test_a_case_without_numbers_has_no_figure():
     result = CaseResult("made_up", 1, "A case")
     result.add("once", Outcome(message="no"), 0.0, expected=(REFUSED,))
-    assert picture(result) is None
+    assert case_figure(result) is None

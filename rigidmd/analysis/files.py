@@ -78,7 +78,7 @@ def write_results(
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for picture, curve in pictures.items():
-        write_figure(picture, partial(draw_curve, curve))
+        write_figure(picture, partial(curve_figure, curve))
     return [folder / ANALYSIS, *(path for path in written if path.is_file())]
 
 
@@ -165,7 +165,7 @@ def _read_curve(folder: Path, described: dict[str, Any]) -> Curve:
     return Curve(**described | {"axis": (head[0], table[head[0]]), "columns": columns, "errors": errors})
 
 
-def draw_curve(curve: Curve):
+def curve_figure(curve: Curve):
     """The figure of a curve: each column with a band of one standard error."""
     from rigidmd.figures.picture import Picture
 

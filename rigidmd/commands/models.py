@@ -53,10 +53,10 @@ def _models(options: argparse.Namespace) -> int:
     if not draws:
         print(molecule_text(found))
         return 0
-    from rigidmd.view.molecule_figure import draw_molecule
+    from rigidmd.view.molecule_figure import write_molecule_figure
 
     path = Path(options.output or f"{Path(options.model).stem}.png")
-    draw_molecule(path, found, options.force)
+    write_molecule_figure(path, found, options.force)
     print(f"{found.name} is drawn in {path}")
     return 0
 

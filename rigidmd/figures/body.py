@@ -37,7 +37,7 @@ FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 MOST_POINTS, FLOOR = 10_000, 1e-17
 
 
-def draw_motion(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
+def write_motion_figures(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
     """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
     written = []
     for stem, figure in figures.items():

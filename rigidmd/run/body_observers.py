@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidmd.core.state import NOW, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
-from rigidmd.figures.body import FIGURES, body_figures, draw_motion
+from rigidmd.figures.body import FIGURES, body_figures, write_motion_figures
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.write import write_columns, write_npz
@@ -128,7 +128,7 @@ class Figures(Observer):
             failed = None
             for stem, figure in body_figures(run.system, results.samples).items():
                 try:
-                    results.files += draw_motion(run.path(""), {stem: figure})
+                    results.files += write_motion_figures(run.path(""), {stem: figure})
                 except Exception as error:  # of many types; the other figures are drawn first
                     failed = failed or error
             if failed is not None:

@@ -47,7 +47,7 @@ def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation
     if any("</script" in text.lower() for text in part.scripts):
         raise ValueError("a script has the end tag of its element")
     return [
-        f'<div class="film">{left}{plots.draw(record)}</div>',
+        f'<div class="film">{left}{plots.plots_part(record)}</div>',
         f'<script type="application/json" id="film-data">{data}</script>',
         *(f"<script>{text}</script>" for text in part.scripts),
     ]

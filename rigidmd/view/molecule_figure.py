@@ -33,7 +33,7 @@ class _Sphere(NamedTuple):
     radius: float  # Å
 
 
-def draw_molecule(path: Path, m: Molecule, force: bool = False) -> None:
+def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file, whose extension sets the format. Raises OutputError."""
     from rigidmd.figures.picture import Picture
 

@@ -18,7 +18,6 @@ from rigidmd.scene.validation import did_you_mean
 from rigidmd.view.page import figure as figure_part
 
 if TYPE_CHECKING:
-    from rigidmd.figures.picture import Picture
     from rigidmd.run.results import Results
 import time as clock
 from typing import TYPE_CHECKING, cast
@@ -99,15 +98,14 @@ def _body_panels(record: Record) -> list[Panel]:
     return found
 
 
-def draw(record: Record) -> str:
+def plots_part(record: Record) -> str:
     """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the time axis as fractions
     of the width, data-from and data-to, its limits."""
-    return f'<div class="plots">{"".join(_draw(record, k, panel) for k, panel in enumerate(panels(record)))}</div>'
+    figures = "".join(_panel_part(record, k, panel) for k, panel in enumerate(panels(record)))
+    return f'<div class="plots">{figures}</div>'
 
 
-def _draw(record: Record, k: int, panel: Panel) -> str:
-    from rigidmd.figures.picture import Picture
-
+def _panel_part(record: Record, k: int, panel: Panel) -> str:
     figure = Picture(figsize=(WIDTH, HEIGHT), layout="constrained")
     axis = figure.subplots()
     draw_panel(axis, record, panel)

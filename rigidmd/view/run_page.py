@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.analysis.files import draw_curve, read_results
+from rigidmd.analysis.files import curve_figure, read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
@@ -64,7 +64,7 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     else:
         yield section("Means of each stage", _means(record), _drifts(record))
     if not animation:
-        yield section("Plots", plots.draw(record))
+        yield section("Plots", plots.plots_part(record))
     yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
     simulated, left_out = _scene_description(record)
@@ -125,7 +125,7 @@ def _analyses(record: Record) -> Iterator[str]:
         else:
             phrases.append(phrase)
         for curve in result.curves:
-            svg = figure(draw_curve(curve), f"analysis-{curve.file}", curve.label)
+            svg = figure(curve_figure(curve), f"analysis-{curve.file}", curve.label)
             figures.append(f"<figure>{svg}</figure>")
     if not rows and not figures and not left_out:
         return

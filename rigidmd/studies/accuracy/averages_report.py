@@ -118,7 +118,7 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
     full_table(found).write(folder / FILES[0])
     write_json(folder / FILES[1], to_json(found, command), indent=2, allow_nan=False)
     title = f"{found.name}: bias of averages over {found.sampled:g} ps"
-    write_figure(folder / FILES[2], lambda: figure_of(found), title)
+    write_figure(folder / FILES[2], lambda: averages_figure(found), title)
     write_page(folder / FILES[3], lambda: averages_page(found, command))
     return [folder / name for name in FILES if (folder / name).is_file()]
 
@@ -159,7 +159,7 @@ def _run_to_json(found: Averages, run: AverageRun) -> dict:
     }  # fmt: skip
 
 
-def figure_of(found: Averages):
+def averages_figure(found: Averages):
     """Bias against the step, a panel for each quantity, with error bars and the band within 1 %."""
     from rigidmd.figures.picture import Picture
 
@@ -213,7 +213,7 @@ def averages_page(found: Averages, command: str) -> str:
     parts = [
         f'<p class="faint">{plain(about)}; {found.sampled:g} ps at every step</p>',
         section(f"Steps (fs) at which an average is off by {BIAS_LIMIT:.0%}", *steps),
-        section("Bias against the time step", wide(figure_of(found), "averages", "biases over time steps")),
+        section("Bias against the time step", wide(averages_figure(found), "averages", "biases over time steps")),
         section("All runs: biases, U in kT per degree of freedom", *all_runs),
         section("How to repeat it", code(command)),
     ]

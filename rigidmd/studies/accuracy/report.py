@@ -226,7 +226,8 @@ def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> lis
     trial_table(found).write(folder / FILES[0])
     if (averages := averages_table(found)).rows:
         averages.write(folder / FILES[3])
-    write_figure(folder / FILES[1], lambda: figure_of(found), f"{found.trial_system.name}: error against run time")
+    title = f"{found.trial_system.name}: error against run time"
+    write_figure(folder / FILES[1], lambda: accuracy_figure(found), title)
     write_page(folder / FILES[2], lambda: accuracy_page(found, command))
     return [folder / name for name in FILES if (folder / name).is_file() and (name != FILES[3] or averages.rows)]
 
@@ -246,7 +247,7 @@ def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
             before = at
 
 
-def figure_of(found: IntegratorAccuracy):
+def accuracy_figure(found: IntegratorAccuracy):
     """Log error against log run time, a curve for each integrator; rings mark the best trials, bars the time spread."""
     from rigidmd.figures.picture import Picture
 
@@ -303,7 +304,7 @@ def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     ]  # fmt: skip
     parts = [
         section("Recommendations", table(titles, rows), items(remarks(found))),
-        section("Error against run time", wide(figure_of(found), "accuracy", "log error over log run time")),
+        section("Error against run time", wide(accuracy_figure(found), "accuracy", "log error over log run time")),
         section("All trials", table(*trial_table(found).shown(), marked=colored)),
     ]
     if any(trial.averages for trial in found.trials):

@@ -105,7 +105,7 @@ def markdown(results: list[CaseResult], command: str, machine: str) -> str:
     return "\n".join([*lines, "", *(f"- {line}" for line in conclusions(results)), ""])
 
 
-def picture(result: CaseResult, styles: dict[str, dict] | None = None):
+def case_figure(result: CaseResult, styles: dict[str, dict] | None = None):
     """A small figure of a case: errors over the varied quantity, and of conserved quantities over the step.
 
     styles : integrator -> colour and marker; None without numbers
@@ -213,7 +213,7 @@ def _counts(result: CaseResult) -> list[Raw]:
 def _case(result: CaseResult, styles: dict[str, dict]) -> str:
     counts = Counter(t.verdict for t in result.runs)
     badges = " ".join(_badge(v, str(counts[v])) for v in VERDICTS if counts[v])
-    drawn = picture(result, styles)
+    drawn = case_figure(result, styles)
     shown = "" if drawn is None else wide(drawn, result.name, result.name)
     messages = dict.fromkeys(t.outcome.message for t in result.runs if t.outcome.message)
     notes = [*result.notes, *(Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES])]

@@ -30,7 +30,7 @@ class SweepCurve(NamedTuple):
     errors: np.ndarray
 
 
-def draw_sweep(table: Table, name: str) -> Path | None:
+def write_sweep_figure(table: Table, name: str) -> Path | None:
     """Write sweep.png; None without anything to draw. Raises OutputError."""
     shown, rows = _shown_columns(table), [row for row in table.rows if row.runs]
     if not shown or not rows:

@@ -24,7 +24,7 @@ from rigidmd.run.signals import signal_handler
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, Pool
-from rigidmd.studies.sweep.figure import draw_sweep
+from rigidmd.studies.sweep.figure import write_sweep_figure
 from rigidmd.studies.sweep.folder import (
     FAILED,
     FINISHED,
@@ -194,7 +194,7 @@ def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
     if not any(row.runs for row in table.rows):
         return table, []
     table.as_columns().write(folder / TABLE, csv.QUOTE_NONNUMERIC)
-    files = [folder / TABLE, draw_sweep(table, manifest.name)]
+    files = [folder / TABLE, write_sweep_figure(table, manifest.name)]
     return table, [path for path in files if path is not None and path.is_file()]
 
 
