@@ -10,7 +10,7 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
 from rigidmd.engines.system import System
 from rigidmd.figures.body import body_figures
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, shown_range, thin_series
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, new_figure, shown_range, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,15 +37,13 @@ DRAWN = ("time", "drift", "potential", "kinetic", "temperature_translation", "te
 
 def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     """The drift of the conserved energy in each stage, on the scale of the last; energies and temperatures."""
-    from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
-
     stages, n = system.scene.stages, len(system.model.species)
     shown = moving(stages, samples["stage"])
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
     last = stage == stage[-1]
     known = bool(np.isfinite(column["drift"][last]).any())  # an external engine may not report it
-    figure = Picture(figsize=(8, 7), layout="constrained")
+    figure = new_figure(8, 7)
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
     if known:

@@ -5,13 +5,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.errors import RigidMDError, RigidMDWarning
+
+if TYPE_CHECKING:
+    from rigidmd.figures.picture import Picture
 
 #: Most points of a curve that are drawn at once. The renderer fails on 200,000 points across a figure.
 AT_ONCE = 5000
@@ -88,6 +91,13 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
         if title:
             figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
         save_figure(figure, temporary, dpi=150)
+
+
+def new_figure(width: float, height: float, layout: str | None = "constrained", **options) -> "Picture":
+    """An empty figure of this size, inches."""
+    from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
+
+    return Picture(figsize=(width, height), layout=layout, **options)
 
 
 def open_axis(axis, **ticks) -> None:

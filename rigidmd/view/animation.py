@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import INK, WARM
+from rigidmd.figures.style import INK, WARM, new_figure
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
 from rigidmd.view.animation_page import animation_of
@@ -61,15 +61,13 @@ def write_film(
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    from rigidmd.figures.picture import Picture
-
     check_writer(path)
     record = read_record(folder)
     animation = animation_of(record, MOST_FRAMES)
     begin, (end, notes) = float(animation.time[0]), animation.loop_end()
     pixels = 2 * round((height or HEIGHT[path.suffix]) / 2)
     across = 2 * round(pixels * (1.75 if with_plots else 1.0) / 2)
-    figure = Picture(figsize=(INCHES * across / pixels, INCHES), dpi=pixels / INCHES)
+    figure = new_figure(INCHES * across / pixels, INCHES, layout=None, dpi=pixels / INCHES)
     FigureCanvasAgg(figure)
     width = 1 / 1.75 if with_plots else 1.0
     axes = figure.add_axes((0.0, 0.0, width, 1.0))
@@ -108,9 +106,7 @@ def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.lines import Line2D
 
-    from rigidmd.figures.picture import Picture
-
-    still = Picture(figsize=figure.get_size_inches(), dpi=figure.dpi)
+    still = new_figure(*figure.get_size_inches(), layout=None, dpi=figure.dpi)
     canvas = FigureCanvasAgg(still)
     panels = plots.panels(record)[:PANELS]
     found = []

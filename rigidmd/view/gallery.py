@@ -11,7 +11,7 @@ import numpy as np
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
 from rigidmd.errors import InputError
-from rigidmd.figures.style import save_figure
+from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
 from rigidmd.scene import Scene
@@ -67,10 +67,8 @@ def write_gallery(
 
 
 def _picture(record: Record) -> str:
-    from rigidmd.figures.picture import Picture
-
     animation = BodyAnimation(record)
-    figure = Picture(figsize=(INCHES, INCHES), dpi=DPI)
+    figure = new_figure(INCHES, INCHES, layout=None, dpi=DPI)
     animation.draw(figure.add_axes((0, 0, 1, 1)), float(np.interp(RUN_FRACTION, [0, 1], animation.time[[0, -1]])))
     stream = io.BytesIO()
     save_figure(figure, stream, format="png", dpi=DPI)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.files import atomic_file
-from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, save_figure, settings
+from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_figure, settings
 from rigidmd.io.bonds import COVALENT, bonds
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import Molecule
@@ -35,15 +35,13 @@ class _Sphere(NamedTuple):
 
 def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file, whose extension sets the format. Raises OutputError."""
-    from rigidmd.figures.picture import Picture
-
     check_target(path, EXTENSIONS, force, "figure")
     view = _view(m)
     seen = m.positions_body @ view.T  # right, up, towards the viewer
     spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]
     reach = [max(s.radius, m.sigma[i] / 2 if m.epsilon[i] > 0 else 0.0) for i, s in enumerate(spheres)]
     half = 1.12 * max(np.abs(s.centre).max() + r for s, r in zip(spheres, reach, strict=True))
-    figure = Picture(figsize=(INCHES, INCHES * 1.12))
+    figure = new_figure(INCHES, INCHES * 1.12, layout=None)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
     axes.set_axis_off()
     _diameters(axes, m, spheres)

@@ -1,32 +1,25 @@
-"""Plots of the columns of a run against time: small ones for pages, where animations add a cursor, and figures."""
+"""Plots of columns against time: small ones for pages, where animations add a cursor, figures, and live ones."""
 
+import time as clock
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.samples import MATRIX, Column, Samples
+from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
 from rigidmd.engines.system import System
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, open_axis, shown_range, thin_series
-from rigidmd.run.record import Record
-from rigidmd.scene.validation import did_you_mean
-from rigidmd.view.page import figure as figure_part
-
-if TYPE_CHECKING:
-    from rigidmd.run.results import Results
-import time as clock
-from typing import TYPE_CHECKING, cast
-
-from rigidmd.engines.samples import BODY_COLUMNS
+from rigidmd.figures.style import COOL, FAINT, INK, WARM, new_figure, open_axis, shown_range, thin_series
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
+from rigidmd.run.record import Record
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.validation import not_none
+from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.view.page import figure as figure_part
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -106,7 +99,7 @@ def plots_part(record: Record) -> str:
 
 
 def _panel_part(record: Record, k: int, panel: Panel) -> str:
-    figure = Picture(figsize=(WIDTH, HEIGHT), layout="constrained")
+    figure = new_figure(WIDTH, HEIGHT)
     axis = figure.subplots()
     draw_panel(axis, record, panel)
     axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
@@ -190,7 +183,7 @@ def columns_figure(record: Record, names: Sequence[str], described: dict[str, Co
     units: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         units.setdefault(described[name].unit, []).append(name)
-    figure = Picture(figsize=(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN), layout="constrained")
+    figure = new_figure(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN)
     axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (unit, members) in zip(axes, units.items(), strict=True):
         title = axis_label(members[0], unit) if len(members) == 1 else ""

@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
 from rigidmd.io.table import Column, Table, with_error
 from rigidmd.io.write import write_json
 from rigidmd.studies.accuracy.bias import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
@@ -161,12 +161,10 @@ def _run_to_json(found: Averages, run: AverageRun) -> dict:
 
 def averages_figure(found: Averages):
     """Bias against the step, a panel for each quantity, with error bars and the band within 1 %."""
-    from rigidmd.figures.picture import Picture
-
     shown = [quantity for quantity in found.quantities if found.points(quantity)]
     columns = min(3, max(1, len(shown)))
     rows = max(1, -(-len(shown) // columns))
-    figure = Picture(figsize=(3.7 * columns, 3.0 * rows + 0.9), layout="constrained")
+    figure = new_figure(3.7 * columns, 3.0 * rows + 0.9)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     methods = methods_of(found)
     handles = {}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, open_axis, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, new_figure, open_axis, write_figure
 from rigidmd.io.table import Column, Table, with_error
 from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
@@ -249,11 +249,9 @@ def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
 
 def accuracy_figure(found: IntegratorAccuracy):
     """Log error against log run time, a curve for each integrator; rings mark the best trials, bars the time spread."""
-    from rigidmd.figures.picture import Picture
-
     s = found.trial_system
     per = "ps" if s.time_unit == "fs" else "s"
-    figure = Picture(figsize=(10, 4.8), layout="constrained")
+    figure = new_figure(10, 4.8)
     left, right = figure.subplots(1, 2)
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
     titles = {

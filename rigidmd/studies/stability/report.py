@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.files import write_text
-from rigidmd.figures.style import INK, curve_style, label_minor_ticks, open_axis
+from rigidmd.figures.style import INK, curve_style, label_minor_ticks, new_figure, open_axis
 from rigidmd.io.table import format_cell
 from rigidmd.io.write import columns_text, write_csv
 from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
@@ -110,14 +110,12 @@ def case_figure(result: CaseResult, styles: dict[str, dict] | None = None):
 
     styles : integrator -> colour and marker; None without numbers
     """
-    from rigidmd.figures.picture import Picture
-
     styles = styles or styles_of([result])
     varied = len({t.x for t in result.runs if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
     panels = [kind for kind, has in (("runs", varied), ("limits", result.limits)) if has]
     if not panels:
         return None
-    figure = Picture(figsize=(4.6 * len(panels), 3.0), layout="constrained")
+    figure = new_figure(4.6 * len(panels), 3.0)
     for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
         for family in result.families:
             (_draw_runs if kind == "runs" else _draw_limits)(axis, result, family, styles[family])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
 from rigidmd.studies.sweep.folder import FIGURE, SEED, describe_values, short_keys, value_name
 from rigidmd.studies.sweep.table import DRIFT, MAIN, MAIN_OF_BODY, SweepRow, Table
 
@@ -59,8 +59,6 @@ def _shown_columns(table: Table) -> list[str]:
 
 def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
     """A panel for each column against the first key with numbers, else the first key; without keys against the seed."""
-    from rigidmd.figures.picture import Picture
-
     columns = {key: [row.values[key] for row in table.rows] for key in table.keys}
     numbers = [key for key, values in columns.items() if all(type(value) in (int, float) for value in values)]
     key = [*numbers, *table.keys, SEED][0]
@@ -68,7 +66,7 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
     words = list(dict.fromkeys(map(value_name, columns[key]))) if table.keys and not numbers else []
     across = min(ACROSS, len(shown))
     down = -(-len(shown) // across)
-    figure = Picture(figsize=(WIDTH * across, HEIGHT * down + 0.4), layout="constrained")
+    figure = new_figure(WIDTH * across, HEIGHT * down + 0.4)
     axes = list(figure.subplots(down, across, squeeze=False).flat)
     for axis, column in zip(axes, shown, strict=False):
         curves = _curves(table, rows, key, words, column)
