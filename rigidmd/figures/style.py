@@ -93,7 +93,7 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
         save_figure(figure, temporary, dpi=150)
 
 
-def new_figure(width: float, height: float, layout: str | None = "constrained", **options) -> "Picture":
+def new_figure(width: float, height: float, layout: Any = "constrained", **options) -> "Picture":
     """An empty figure of this size, inches."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
