@@ -4,7 +4,6 @@ import contextlib
 import signal
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from typing import cast
 
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.run.results import Results
@@ -71,15 +70,10 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
             _, running = wait(running, POLL_INTERVAL)
             if received:
                 stop_all()  # repeatedly: a run that was just beginning may have missed it
-    _raise_first([future.exception() for future in futures])
-    return [future.result() for future in futures]
-
-
-def _raise_first(errors: Sequence[BaseException | None]) -> None:
-    """Raise the first error, if there is one, with a note on which runs failed."""
-    failed = [k for k, error in enumerate(errors) if error is not None]
-    if failed:
-        error = cast(BaseException, errors[failed[0]])
-        which = ", ".join(str(k + 1) for k in failed)
-        error.add_note(f"of {len(errors)} runs at once these failed: {which}; this is the error of the first")
+    failed = {str(k): error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None}
+    for error in failed.values():
+        error.add_note(
+            f"of {len(futures)} runs at once these failed: {', '.join(failed)}; this is the error of the first"
+        )
         raise error
+    return [future.result() for future in futures]

@@ -19,11 +19,12 @@ from rigidmd.engines.observables import observe
 from rigidmd.engines.ode.rates import SMALLEST_SINE
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
-from rigidmd.run.pilot.choice import choose
+from rigidmd.run.pilot.choice import Choice, choose
 from rigidmd.run.pilot.trials import Method, TrialSystem
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SAMPLES
 from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: General ODE solvers for the textbook equations of a body, for comparison with the engine's schemes.
@@ -197,8 +198,8 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
         if scheme.exact_rotor or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
     }
     targets = stage.energy_error_kT, stage.trajectory_error
-    integrator, timestep, reason = _choose_step(trial_system, longest, *targets, stage.duration)
-    return stage.with_integrator(integrator, timestep), reason
+    found = _choose_step(trial_system, longest, *targets, stage.duration)
+    return stage.with_integrator(found.integrator, found.timestep), found.reason
 
 
 #: Least fraction of a chosen step to which it is shortened to fit the interval of samples.
@@ -210,12 +211,14 @@ def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]
     run = scene.run
     trial_system, _ = body_trial_system(scene, applied=applied)
     longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
-    integrator, timestep, reason = _choose_step(trial_system, longest, run.energy_error, run.trajectory_error)
-    chosen, timestep = timestep, _fit_step(timestep, run.duration_s, scene.output.interval_s)
+    found = _choose_step(trial_system, longest, run.energy_error, run.trajectory_error)
+    chosen, timestep = found.timestep, _fit_step(found.timestep, run.duration_s, scene.output.interval_s)
     fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     none = {"energy_error": None, "trajectory_error": None}
-    changed = run.model_copy(update={"integrator": integrator, "timestep_s": timestep} | none)
-    return scene.model_copy(update={"run": changed}), f"{integrator} at {chosen:g} s chosen{fitted}: {reason}"
+    changed = run.model_copy(update={"integrator": found.integrator, "timestep_s": timestep} | none)
+    return scene.model_copy(
+        update={"run": changed}
+    ), f"{found.integrator} at {chosen:g} s chosen{fitted}: {found.reason}"
 
 
 def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
@@ -234,11 +237,8 @@ def _fit_step(timestep: float, duration: float, interval: float | None) -> float
 def _choose_step(
     trial_system: TrialSystem, longest: dict[str, float], energy: float | None, trajectory: float | None,
     duration: float | None = None,
-) -> tuple[str, float, str]:  # fmt: skip
+) -> Choice:  # fmt: skip
+    """The choice for a limit of the energy error, or else of the error of the trajectory."""
     if energy is not None:
-        found = choose(trial_system, energy, "energy_rms", longest, duration)
-    elif trajectory is not None:
-        found = choose(trial_system, trajectory, "trajectory_error", longest)
-    else:
-        raise ValueError("no error is asked for")
-    return found.integrator, found.timestep, found.reason
+        return choose(trial_system, energy, "energy_rms", longest, duration)
+    return choose(trial_system, not_none(trajectory), "trajectory_error", longest)
