@@ -70,10 +70,9 @@ def run_together(simulations: Sequence[Simulation], jobs: int | None = None) -> 
             _, running = wait(running, POLL_INTERVAL)
             if received:
                 stop_all()  # repeatedly: a run that was just beginning may have missed it
-    failed = {str(k): error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None}
-    for error in failed.values():
-        error.add_note(
-            f"of {len(futures)} runs at once these failed: {', '.join(failed)}; this is the error of the first"
-        )
+    failed = {k: error for k, future in enumerate(futures, 1) if (error := future.exception()) is not None}
+    if failed:
+        error, which = next(iter(failed.values())), ", ".join(map(str, failed))
+        error.add_note(f"of {len(futures)} runs at once these failed: {which}; this is the error of the first")
         raise error
     return [future.result() for future in futures]
