@@ -216,9 +216,8 @@ def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]
     fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     none = {"energy_error": None, "trajectory_error": None}
     changed = run.model_copy(update={"integrator": found.integrator, "timestep_s": timestep} | none)
-    return scene.model_copy(
-        update={"run": changed}
-    ), f"{found.integrator} at {chosen:g} s chosen{fitted}: {found.reason}"
+    reason = f"{found.integrator} at {chosen:g} s chosen{fitted}: {found.reason}"
+    return scene.model_copy(update={"run": changed}), reason
 
 
 def _fit_step(timestep: float, duration: float, interval: float | None) -> float:
