@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rigidmd.dynamics.user_kernels import compiled_force, compiled_thermostat
     from rigidmd.run import Every, Moment, Observer, Results, Simulation, run_together
     from rigidmd.scene import BodyScene, MolecularScene, Scene
+    from rigidmd.scene.integrators import integrator
     from rigidmd.studies.sweep.sweeping import sweep
     from rigidmd.view.plots import LivePlot
 
@@ -37,12 +38,13 @@ _HOMES = {
     "resolve": "assemble.scenes", "atoms_of": "assemble.scenes", "scene_from_atoms": "assemble.scenes",
     "Force": "assemble.user_code.force", "trust": "assemble.user_code.trust",
     "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
+    "integrator": "scene.integrators",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
     "LivePlot": "view.live", "sweep": "studies.sweep.sweeping", "analysis": "", "view": "",
 }  # fmt: skip
 __all__ = [
     "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
-    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "pair_law", "resolve",
+    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "pair_law", "resolve",
     "run_together", "scene_from_atoms", "sweep", "trust", "view",
 ]  # fmt: skip
 

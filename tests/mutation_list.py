@@ -112,8 +112,8 @@ RINGS = [
     Mutation(
         "B1", "Monte Carlo barostat: a scene passes N + 1 for N",
         "assemble/stage_flows.py",
-        "float(mobile(system.model).sum()), tail_terms, key",
-        "float(mobile(system.model).sum()) + 1.0, tail_terms, key",
+        "float(mobile(system.model).sum()),",
+        "float(mobile(system.model).sum()) + 1.0,",
         ("test_wiring.py::test_a_monte_carlo_barostat_counts_the_molecules",),
     ),
     Mutation(
@@ -128,16 +128,16 @@ RINGS = [
     ),
     Mutation(
         "B3", "Nose-Hoover: degrees of freedom of translation for those of rotation",
-        "assemble/stage_flows.py",
-        "links, freedom.translation, freedom.rotation)",
-        "links, freedom.translation, freedom.translation)",
+        "dynamics/thermostats.py",
+        "stage.nose_hoover_links, freedom.translation, freedom.rotation",
+        "stage.nose_hoover_links, freedom.translation, freedom.translation",
         ("test_wiring.py::test_chains_count_the_degrees_of_freedom_of_their_motion",),
     ),
     Mutation(
         "B4", "Langevin: frictions of translation and rotation exchanged",
-        "assemble/stage_flows.py",
-        "            return Langevin(thermal, *stage.frictions, key)",
-        "            return Langevin(thermal, *stage.frictions[::-1], key)",
+        "dynamics/thermostats.py",
+        "Langevin(thermal, *stage.frictions, key)",
+        "Langevin(thermal, *stage.frictions[::-1], key)",
         ("test_wiring.py::test_langevin_has_the_friction_of_each_motion",),
     ),
     Mutation(

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 MOST_NUMBERS = 150_000_000
 #: Least samples of a stage for the detection of its equilibration.
 MIN_SAMPLES = 40
-#: Thermostats with random forces on single molecules.
-STOCHASTIC_THERMOSTATS = ("langevin", "andersen")
 
 
 def frames_of_folder(
@@ -112,7 +110,7 @@ def _rigid_frames(
         begin = start
         if begin < first:
             notes = [*notes, f"frames before {first:g} ps are of an earlier stage"]
-    if stage.thermostat_kind in STOCHASTIC_THERMOSTATS:
+    if not stage.keeps_momentum:
         notes = [
             *notes,
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and rotation, and "

@@ -110,7 +110,7 @@ def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> 
             what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
             return [f"run: {what}: use velocity_verlet"]
         return []
-    scheme = SCHEMES[run.integrator].with_rotor(run.rotor)
+    scheme = run.scheme
     if resisted and min(scheme.kicks) < 0:
         forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
         return [f"run: {run.integrator} has negative substeps, which a resistance does not allow: use one of {forward}"]

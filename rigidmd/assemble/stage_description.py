@@ -1,6 +1,8 @@
 """Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved quantities."""
 
-from rigidmd.scene.stage import COMPRESSIBILITY, Stage
+from rigidmd.scene.barostats import BAROSTATS, COMPRESSIBILITY
+from rigidmd.scene.stage import Stage
+from rigidmd.scene.thermostats import THERMOSTATS
 from rigidmd.units import FEMTOSECOND
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.
@@ -30,7 +32,8 @@ def describe_stage(stage: Stage) -> list[str]:
         choice = f"integrator and step chosen at its start for an error of {error}"
         text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
-        text += f", {_thermostat(stage)}"
+        kind, described = stage.thermostat_kind, THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
+        text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
     return [text, f"samples {_sampled(stage)}; conserves {_conserved(stage)}"]
@@ -48,23 +51,14 @@ def _minimisation(stage: Stage) -> list[str]:
     ]
 
 
-def _thermostat(stage: Stage) -> str:
-    text = f"{_ramp(stage.temperatures)} K by {stage.thermostat_kind.replace('_', ' ')}"
-    if stage.thermostat_kind != "langevin":
-        return f"{text}, {stage.thermostat_time:g} ps"
-    translation, rotation = stage.frictions
-    of_rotation = f" ({rotation:g}/ps of rotation)" if rotation != translation else ""
-    return f"{text}, friction {translation:g}/ps{of_rotation}"
-
-
 def _barostat(stage: Stage) -> str:
-    kind = stage.barostat_kind.replace("_", " ") or "a piston"
-    text = f"{_pressure(stage)} bar by {kind}, {stage.pressure_coupling.replace('_', '-')}"
-    if stage.barostat_kind != "monte_carlo":
+    kind, values = BAROSTATS[stage.barostat_kind], stage.barostat_values
+    title = kind.title or stage.barostat_kind.replace("_", " ")
+    text = f"{_pressure(stage)} bar by {title}, {stage.pressure_coupling.replace('_', '-')}"
+    if "barostat_time_ps" in values:
         text += f", {stage.barostat_time:g} ps"
-    if stage.barostat_kind:
-        every = stage.moves_every
-        text += f", a move every {every} steps" if every > 1 else ", a move every step"
+    if "barostat_interval_ps" in values:
+        text += f", a move every {f'{stage.moves_every} steps' if stage.moves_every > 1 else 'step'}"
     water = ", of water" if stage.compressibility == COMPRESSIBILITY else ""
     return f"{text}; compressibility {stage.compressibility:g}/bar{water}"
 

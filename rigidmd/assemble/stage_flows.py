@@ -3,55 +3,48 @@
 from math import inf
 from typing import NamedTuple
 
-import numpy as np
-
 from rigidmd.core.integrators import Scheme
-from rigidmd.dynamics.barostats import COUPLINGS, CellRescaling, Pressure, VolumeMoves, piston
+from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import Andersen, Langevin, NoseHoover, Ramp, VelocityRescaling, constant_ramp
+from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp, VelocityRescaling, constant_ramp
 from rigidmd.engines.system import System
-from rigidmd.scene.stage import Six, Stage
+from rigidmd.scene import barostats, thermostats
+from rigidmd.scene.barostats import Six
+from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
-
-#: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
-WIDTH = 2.0
 
 
 def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
     scene, stage = system.scene, system.scene.stages[k]
-    found = stage.scheme
-    if (user := system.thermostat) is not None:
-        thermostat = user.for_stage(system, k) if hasattr(user, "for_stage") else user
-        found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
-    elif stage.has_thermostat:
-        found = found.with_thermostat(thermostat_of(system, k), halved=stage.thermostat_kind != "velocity_rescaling")
-    elif not stage.has_barostat and any(other.thermostat_kind == "velocity_rescaling" for other in scene.stages):
+    found, thermostat = stage.scheme, system.thermostat
+    if thermostat is not None and hasattr(thermostat, "for_stage"):
+        thermostat = thermostat.for_stage(system, k)
+    elif thermostat is None and stage.has_thermostat:
+        thermostat = thermostat_of(system, k)
+    elif (
+        thermostat is None
+        and not stage.has_barostat
+        and any(other.thermostat_kind == thermostats.DEFAULT for other in scene.stages)
+    ):
         # An idle thermostat, so that all stages run the same machine code.
-        idle = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
-        found = found.with_thermostat(idle)
-    if stage.ensemble == "npt":
-        found = found.with_barostat(barostat_of(system, k), stage.moves_every)
-    elif stage.ensemble == "nph":
-        found = found.with_piston(barostat_of(system, k))
+        thermostat = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
+    if thermostat is not None:
+        found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
+    if stage.has_barostat:
+        barostat = barostat_of(system, k)
+        in_steps = barostats.BAROSTATS[stage.barostat_kind].in_verlet_steps
+        found = found.with_piston(barostat) if in_steps else found.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         found = found.with_momentum_removal(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))
     return found
 
 
 def thermostat_of(system: System, k: int) -> NamedTuple:
-    stage, freedom = system.scene.stages[k], system.freedom_in(k)
+    stage = system.scene.stages[k]
     thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)
-    match stage.thermostat_kind:
-        case "langevin":
-            return Langevin(thermal, *stage.frictions, key)
-        case "andersen":
-            return Andersen(thermal, stage.thermostat_time, key)
-        case "nose_hoover":
-            links = stage.nose_hoover_links
-            return NoseHoover(thermal, stage.thermostat_time, links, freedom.translation, freedom.rotation)
-    return VelocityRescaling(thermal, stage.thermostat_time, freedom.total, key)
+    return THERMOSTATS[stage.thermostat_kind](stage, thermal, system.freedom_in(k), key)
 
 
 def barostat_of(system: System, k: int) -> NamedTuple:
@@ -61,19 +54,12 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     pressure = Pressure(_scaled(first, BAR), _scaled(last, BAR), float(stage.steps))
     tail = system.tail
     tail_terms = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
-    compressibility, volume = stage.compressibility / BAR, system.state.volume
-    if stage.ensemble == "nph":
-        return piston(pressure, stage.barostat_time, compressibility, volume, tail_terms)
-    if stage.barostat_kind == "monte_carlo":
-        spread = np.sqrt(BOLTZMANN * max(stage.temperatures) * compressibility * volume)
-        return VolumeMoves(
-            _thermal(stage), pressure, float(WIDTH * spread), float(mobile(system.model).sum()), tail_terms, key
-        )
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
-    rate = compressibility / stage.barostat_time
-    return CellRescaling(
-        _thermal(stage), pressure, rate, COUPLINGS[stage.pressure_coupling], (x, y, z), tail_terms, key
-    )
+    given = Confinement(
+        _thermal(stage), pressure, stage.compressibility / BAR, system.state.volume, float(mobile(system.model).sum()),
+        (x, y, z), tail_terms, key,
+    )  # fmt: skip
+    return BAROSTATS[stage.barostat_kind](stage, given)
 
 
 def _scaled(tensor: Six, factor: float) -> Six:

@@ -31,6 +31,8 @@ COUPLINGS = {
     "anisotropic": (0, 1, 2, -1, -1, -1),
     "flexible": (0, 1, 2, 3, 4, 5),
 }
+#: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
+WIDTH = 2.0
 #: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start in one move.
 LONGEST_DRIFT = 0.01
 
@@ -90,14 +92,45 @@ class Piston(NamedTuple):
     """
 
     pressure: Pressure
-    inverse_mass: float  # 1/M, Å⁴/u, see `piston`
+    inverse_mass: float  # 1/M, Å⁴/u
     tail: tuple[float, float]
 
+    variables = 1  # how many numbers it has in `state.extra_variables`
 
-def piston(pressure: Pressure, period: float, compressibility: float, volume: float, tail: tuple) -> Piston:
-    """A piston for which a volume of this compressibility (Å ps²/u) oscillates with a period (ps). The spring is dP/dV
-    = -1/(compressibility V), so M = (period/2 pi)²/(compressibility V)."""
-    return Piston(pressure, compressibility * volume * (2 * np.pi / period) ** 2, tail)
+
+class Confinement(NamedTuple):
+    """What a barostat is made from, besides the keys of its stage."""
+
+    thermal_energy: Ramp
+    pressure: Pressure
+    compressibility: float  # Å ps²/u
+    volume: float  # at the start, Å³
+    molecules: float  # see `VolumeMoves`
+    at_rest: tuple[float, float, float]  # see `CellRescaling`
+    tail: tuple[float, float]
+    key: Key
+
+
+def _cell_rescaling(stage, given: Confinement) -> CellRescaling:
+    rate, coordinate = given.compressibility / stage.barostat_time, COUPLINGS[stage.pressure_coupling]
+    return CellRescaling(given.thermal_energy, given.pressure, rate, coordinate, given.at_rest, given.tail, given.key)
+
+
+def _volume_moves(stage, given: Confinement) -> VolumeMoves:
+    thermal = given.thermal_energy
+    width = WIDTH * np.sqrt(max(thermal.first, thermal.last) * given.compressibility * given.volume)
+    return VolumeMoves(thermal, given.pressure, float(width), given.molecules, given.tail, given.key)
+
+
+def _piston(stage, given: Confinement) -> Piston:
+    """With it, the volume oscillates with the period barostat_time_ps: the spring is dP/dV = -1/(compressibility V), so
+    M = (period/2 pi)²/(compressibility V)."""
+    inverse_mass = given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2
+    return Piston(given.pressure, inverse_mass, given.tail)
+
+
+#: Name of a barostat in `scene.barostats` -> the function that makes it for a stage.
+BAROSTATS = {"cell_rescaling": _cell_rescaling, "monte_carlo": _volume_moves, "piston": _piston}
 
 
 class BarostatWorkspace(NamedTuple):

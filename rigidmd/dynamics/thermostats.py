@@ -53,6 +53,8 @@ class VelocityRescaling(NamedTuple):
     degrees_of_freedom: int
     key: Key
 
+    halved = False  # one flow after each step, not half of it before and half after
+
 
 class Langevin(NamedTuple):
     """Friction and noise on every momentum: the Ornstein-Uhlenbeck process, solved exactly. p <- c p + sqrt(m kT (1 -
@@ -94,6 +96,20 @@ class NoseHoover(NamedTuple):
     def variables(self) -> int:
         """How many numbers it has in `state.extra_variables`."""
         return 4 * self.links
+
+
+#: Name of a thermostat in `scene.thermostats` -> the function that makes it for a stage, from kB T, the degrees of
+#: freedom and the key of its random numbers.
+THERMOSTATS = {
+    "velocity_rescaling": lambda stage, thermal, freedom, key: VelocityRescaling(
+        thermal, stage.thermostat_time, freedom.total, key
+    ),
+    "langevin": lambda stage, thermal, freedom, key: Langevin(thermal, *stage.frictions, key),
+    "nose_hoover": lambda stage, thermal, freedom, key: NoseHoover(
+        thermal, stage.thermostat_time, stage.nose_hoover_links, freedom.translation, freedom.rotation
+    ),
+    "andersen": lambda stage, thermal, freedom, key: Andersen(thermal, stage.thermostat_time, key),
+}
 
 
 def thermostat_workspace() -> np.ndarray:

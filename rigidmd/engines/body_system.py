@@ -99,8 +99,8 @@ class BodySystem:
         run = self.scene.run
         if run.is_auto:
             return SCHEMES["velocity_verlet"]
-        if run.integrator in SCHEMES:
-            return SCHEMES[run.integrator].with_rotor(run.rotor)
+        if run.has_scheme:
+            return run.scheme
         found = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
         if run.integrator == RK4:
             return found

@@ -18,6 +18,11 @@ def schema() -> dict[str, Any]:
     kinds: list[tuple[type[BaseModel], JsonSchemaMode]] = [(BodyScene, "validation"), (MolecularScene, "validation")]
     _, found = models_json_schema(kinds, schema_generator=_TomlSchema)
     found["$defs"]["Molecules"]["properties"]["model"]["enum"] = available_models()
+    for kind, section in (("MolecularScene", "Stage"), ("BodyScene", "Run")):  # other names need [[integrators]]
+        enum = found["$defs"][section]["properties"]["integrator"].pop("enum")
+        known = {"properties": {"integrator": {"enum": enum}}}
+        sections = {"run": known} if section == "Run" else {"stages": {"items": known}}
+        found["$defs"][kind] |= {"if": {"required": ["integrators"]}, "else": {"properties": sections}}
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "A scene of rigidmd",

@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
 
-from pydantic import Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.files import unreadable_reason
+from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
     DEEPEST,
@@ -22,7 +23,9 @@ from rigidmd.core.toml import (
     shorten_repr,
 )
 from rigidmd.errors import SceneError
+from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
+    MOST_TABLES,
     Section,
     did_you_mean,
     location_of,
@@ -48,12 +51,30 @@ class Scene(Section, Displayed):
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run; default: the name of the file"""
 
+    integrators: tuple[IntegratorRow, ...] = Field(default=(), max_length=MOST_TABLES)
+    """Integrators of users, for stages, [run] of a body and `rigidmd accuracy`"""
+
     SIZES: ClassVar[tuple[float, float]] = (1e-100, 1e100)
     """Smallest and largest absolute value of numbers other than 0, so that squares and products stay finite"""
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
+
+    @field_validator("integrators")
+    @classmethod
+    def _pass_to_stages(cls, rows: tuple[IntegratorRow, ...], info: ValidationInfo):
+        names = [row.name for row in rows]
+        if len(set(names)) < len(names):
+            raise ValueError(f"two have the same name: {', '.join(names)}")
+        if info.context is not None:
+            info.context.update({row.name: row.scheme for row in rows})
+        return rows
+
+    @property
+    def schemes(self) -> dict[str, Scheme]:
+        """The integrators without a thermostat: those of rigidmd and of [[integrators]]."""
+        return SCHEMES | {row.name: row.scheme for row in self.integrators}
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.in_short}>"
@@ -167,7 +188,7 @@ class Scene(Section, Displayed):
             return SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in found])
 
         try:
-            scene = kind.model_validate(data)
+            scene = kind.model_validate(with_registered_rows(data), context={})
         except ValidationError as error:
             raise refusal(faults + validation_messages(error, kind, text, overridden)) from None
         if faults:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
-from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors, rotor_error
+from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
 from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
@@ -33,6 +33,7 @@ from rigidmd.scene.body_forces import (
     PositiveVector,
     Wheel,
 )
+from rigidmd.scene.integrators import IntegratorKey, MovedByScheme
 from rigidmd.scene.limits import BodyWatch
 from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, location_of
 
@@ -240,7 +241,7 @@ class BodyStart(Section):
         return np.array(self.angular_velocity_body_rad_s or (0.0, 0.0, 0.0))
 
 
-class Run(Section):
+class Run(MovedByScheme):
     """Duration and integrator."""
 
     duration_s: Positive
@@ -248,7 +249,7 @@ class Run(Section):
     timestep_s: Positive
     """Time step; with dop853 and radau, whose steps are adaptive, the interval between observations; with auto the
     longest step"""
-    integrator: Literal[(*SCHEMES, AUTO, *SOLVERS)] = "velocity_verlet"  # type: ignore[valid-type]
+    integrator: Annotated[str, IntegratorKey((*SCHEMES, AUTO, *SOLVERS))] = "velocity_verlet"
     """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
     a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None
@@ -267,8 +268,7 @@ class Run(Section):
     def _errors(self):
         if self.rotor is not None and self.integrator in SOLVERS:
             yield f"rotor would do nothing with {self.integrator}"
-        elif fault := self.rotor and rotor_error(self.integrator, self.rotor):
-            yield fault
+        yield from self._rotor_errors()
         if self.formulation is not None and self.integrator not in SOLVERS:
             yield f"formulation would do nothing with {self.integrator}: it is for {', '.join(SOLVERS)}"
         tolerances = [key for key in ("relative_tolerance", "absolute_tolerance") if getattr(self, key) is not None]

@@ -2,34 +2,23 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, Scheme, auto_errors, rotor_error
-from rigidmd.scene.validation import Count, Line, Number, Positive, Section
+from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, auto_errors
+from rigidmd.scene.barostats import BAROSTATS, COMPRESSIBILITY, TIME, BarostatKeys, Six
+from rigidmd.scene.integrators import IntegratorKey, MovedByScheme
+from rigidmd.scene.thermostats import DEFAULT, THERMOSTATS, ThermostatKeys, Values, default_of
+from rigidmd.scene.validation import Count, Line, Positive, Section
 
 MOST_STEPS = 1e12
 
 Ensemble = Literal["nve", "nvt", "npt", "nph", "minimise"]
-Thermostat = Literal["velocity_rescaling", "langevin", "nose_hoover", "andersen"]
-Barostat = Literal["cell_rescaling", "monte_carlo"]
-Coupling = Literal["isotropic", "semi_isotropic", "anisotropic", "flexible"]
-Links = Annotated[int, Strict(), Field(ge=1, le=100)]
-Six = tuple[float, float, float, float, float, float]
-
-#: Time constants (ps) of the thermostats that have one.
-THERMOSTAT_TIMES = {"velocity_rescaling": 0.1, "nose_hoover": 0.5, "andersen": 1.0}
-FRICTION = 1.0  # 1/ps
-BAROSTAT_TIME = 1.0  # ps
-#: Moves of the box per barostat_time_ps.
-MOVES_PER_TIME = 20
-#: Compressibility of water at 298 K and 1 bar, 1/bar.
-COMPRESSIBILITY = 4.5e-5
 
 #: Ensembles in which time passes.
 MOVING = {"nve", "nvt", "npt", "nph"}
 #: Stands in USED for a minimisation in which the cell relaxes.
 CELL = "minimise with a cell"
-#: Key -> the ensembles, thermostats and barostats that use it.
+#: Key -> the ensembles that use it; keys of thermostats and barostats are in their tables.
 USED = {
     "duration_ps": MOVING,
     "timestep_fs": MOVING,
@@ -37,15 +26,9 @@ USED = {
     "rotor": MOVING,
     "temperature_K": {"nvt", "npt"},
     "thermostat": {"nvt", "npt"},
-    "thermostat_time_ps": set(THERMOSTAT_TIMES),
-    "friction_translation_per_ps": {"langevin"},
-    "friction_rotation_per_ps": {"langevin"},
-    "nose_hoover_links": {"nose_hoover"},
     "pressure_bar": {"npt", "nph", "minimise"},
     "pressure_coupling": {"npt", "nph", CELL},
-    "barostat": {"npt"},
-    "barostat_time_ps": {"cell_rescaling", "nph"},
-    "barostat_interval_ps": {"npt"},
+    "barostat": {"npt", "nph"},
     "compressibility_per_bar": {"npt", "nph"},
     "force_limit_kJ_mol_A": {"minimise"},
     "torque_limit_kJ_mol": {"minimise"},
@@ -67,8 +50,8 @@ REFUSED = {
 }
 
 
-class Stage(Section):
-    """A part of a run with one ensemble and one time step."""
+class Timing(Section):
+    """The first keys of a stage."""
 
     name: Line | None = None
     """Name of the stage; default: the name of the ensemble"""
@@ -82,34 +65,12 @@ class Stage(Section):
     """Time step"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
-    thermostat: Thermostat | None = None
-    """velocity_rescaling: stochastic, by Bussi et al.; langevin: friction and noise; nose_hoover: one chain for
-    translation and one for rotation; andersen: collisions. Default: langevin with baoab, else velocity_rescaling"""
-    thermostat_time_ps: Positive | None = None
-    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or mean time between two
-    collisions of a molecule with andersen (1 ps)"""
-    friction_translation_per_ps: Positive | None = None
-    """Friction of langevin on translation; default: 1"""
-    friction_rotation_per_ps: Positive | None = None
-    """Friction of langevin on rotation; default: friction_translation_per_ps"""
-    nose_hoover_links: Links = 3
-    """Links of each Nose-Hoover chain"""
-    pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
-    """Pressure of the barostat, or of the minimisation of the enthalpy; two for a linear change over the stage,
-    [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
-    pressure_coupling: Coupling = "isotropic"
-    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z separately; anisotropic:
-    three edges; flexible: edges and angles"""
-    barostat: Barostat | None = None
-    """Barostat of npt. cell_rescaling: stochastic cell rescaling, made exact by a Metropolis test; monte_carlo: random
-    changes of the volume. Default: cell_rescaling. nph has a piston without friction"""
-    barostat_time_ps: Positive | None = None
-    """Time constant of cell_rescaling, period of the piston of nph; default: 1 ps"""
-    barostat_interval_ps: Positive | None = None
-    """Time between two moves of the box in npt; default: 0.05 of barostat_time_ps"""
-    compressibility_per_bar: Positive | None = None
-    """Compressibility; it sets the speed of the box, not the ensemble. Default: 4.5e-5, of water"""
-    integrator: Literal[(*SCHEMES, *WITH_THERMOSTAT, AUTO)] = "velocity_verlet"  # type: ignore[valid-type]
+
+
+class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
+    """A part of a run with one ensemble and one time step."""
+
+    integrator: Annotated[str, IntegratorKey((*SCHEMES, *WITH_THERMOSTAT, AUTO))] = "velocity_verlet"
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
     scheme and step that keep the requested error with the fewest force evaluations"""
     energy_error_kT: Positive | None = None
@@ -149,7 +110,7 @@ class Stage(Section):
     def _is_available(cls, name: Any):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in REFUSED:
-            raise ValueError(f"{REFUSED[plain]}. There are {', '.join((*Thermostat.__args__, *Barostat.__args__))}")
+            raise ValueError(f"{REFUSED[plain]}. There are {', '.join((*THERMOSTATS, *BAROSTATS))}")
         return name
 
     @field_validator("duration_ps")
@@ -164,15 +125,16 @@ class Stage(Section):
             yield f"an {self.ensemble} stage needs temperature_K"
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
-        if idle := [key for key, where in USED.items() if self._is_given(key) and not where & self._parts]:
+        if idle := [key for key in type(self).model_fields if self._is_given(key) and not self._uses(key)]:
             yield f"{', '.join(idle)} would do nothing {self._where(idle)}"
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
             yield from self._pressure_errors()
-        if fault := rotor_error(self.integrator, self.rotor):
-            yield fault
-        given = [key for key in ("timestep_fs", "rotor") if getattr(self, key) != type(self).model_fields[key].default]
+        if self.has_barostat:
+            yield from self._barostat_errors()
+        yield from self._rotor_errors()
+        given = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
         yield from auto_errors(self.integrator, targets, given)
         if self.bias_kT is not None and not self.has_thermostat:
@@ -185,46 +147,50 @@ class Stage(Section):
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
 
-    @property
-    def _parts(self) -> set[str]:
-        """The ensemble, thermostat and barostat, and CELL where a minimisation relaxes the cell."""
-        cell = {CELL} if self.is_minimisation and self.changes_box else set()
-        return {self.ensemble, self.thermostat_kind, self.barostat_kind} | cell
+    def _uses(self, key: str) -> bool:
+        users, parts = _users(key), {self.ensemble, self.thermostat_kind, self.barostat_kind}
+        return not users or not users.isdisjoint(parts | {CELL} if self.is_minimisation and self.changes_box else parts)
 
     def _where(self, idle: list[str]) -> str:
         """The settings with which keys would do nothing, for the message."""
-        known = [USED[key] for key in idle]
+        users = [_users(key) for key in idle]
         if self.is_minimisation:
-            return "in a minimise stage" + (" without pressure_bar" if all(CELL in where for where in known) else "")
-        of_ensemble = (
-            any(where <= {"nvt", "npt", "nph", "minimise", CELL} for where in known) or not self.has_thermostat
-        )
-        if of_ensemble:
+            return "in a minimise stage" + (" without pressure_bar" if all(CELL in kinds for kinds in users) else "")
+        if any(self.ensemble not in _ensembles(kinds) for kinds in users):
             return f"in an {self.ensemble} stage"
-        concerned = set().union(*known)  # a key of the barostat does not depend on the thermostat
-        kinds = ((self.thermostat_kind, Thermostat.__args__), (self.barostat_kind, Barostat.__args__))
+        concerned = set().union(*users)  # a key of the barostat does not depend on the thermostat
+        kinds = ((self.thermostat_kind, THERMOSTATS), (self.barostat_kind, BAROSTATS))
         return f"with {' and '.join(kind for kind, among in kinds if kind and concerned & set(among))}"
 
-    def _pressure_errors(self) -> list[str]:
-        faults, given, coupling = [], self.pressure_bar, self.pressure_coupling
+    def _pressure_errors(self):
+        given, coupling = self.pressure_bar, self.pressure_coupling
         several = len(given) if isinstance(given, tuple) else 1
         if self.is_minimisation and several == 2:
-            faults.append("pressure_bar: a minimum has one pressure, not one that changes")
+            yield "pressure_bar: a minimum has one pressure, not one that changes"
         if self.integrator == AUTO:
-            faults.append("integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure")
+            yield "integrator = 'auto' is for constant volume: name an integrator for a stage with a pressure"
         unequal = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
         if unequal or (coupling == "isotropic" and several == 3):
-            faults.append(f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}")
+            yield f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}"
         if several == 6 and coupling != "flexible":
-            faults.append(f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}")
-        if self.ensemble == "nph" and (coupling != "isotropic" or several > 2):
-            faults.append("nph allows only an isotropic pressure")
-        if self.ensemble == "nph" and self.integrator in SCHEMES and SCHEMES[self.integrator].exact_rotor:
+            yield f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}"
+
+    def _barostat_errors(self):
+        name, kind = self.barostat_kind, BAROSTATS[self.barostat_kind]
+        others = [other for other in BAROSTATS if self.ensemble in BAROSTATS[other].ensembles and other != name]
+        if self.ensemble not in kind.ensembles:
+            yield f"barostat = {name!r} is for {' and '.join(kind.ensembles)}; {self.ensemble} has {', '.join(others)}"
+            return
+        several = isinstance(self.pressure_bar, tuple) and len(self.pressure_bar) > 2
+        if self.pressure_coupling not in kind.couplings or (several and kind.couplings == ("isotropic",)):
+            allowed = " or ".join(coupling.replace("_", "-") for coupling in kind.couplings)
+            subject = f"barostat = {name!r}" if self.barostat else self.ensemble
+            better = [other for other in others if len(BAROSTATS[other].couplings) > len(kind.couplings)]
+            advice = f"; {better[0]} allows others" if better else ""
+            yield f"{subject} allows only an {allowed} pressure{advice}"
+        if kind.in_verlet_steps and self.has_scheme and self.row.exact_rotor:
             plain = [name for name, scheme in SCHEMES.items() if not scheme.exact_rotor]
-            faults.append(f"nph needs an integrator made of Verlet steps: {', '.join(plain)}")
-        if self.barostat == "monte_carlo" and (coupling != "isotropic" or several > 2):
-            faults.append("barostat = 'monte_carlo' allows only an isotropic pressure; cell_rescaling allows others")
-        return faults
+            yield f"{self.ensemble} needs an integrator made of Verlet steps: {', '.join(plain)}"
 
     @property
     def steps(self) -> int:
@@ -259,24 +225,11 @@ class Stage(Section):
         """This stage with the defaults of all keys that it uses."""
         found: dict[str, Any] = {}
         if self.has_thermostat and not self.thermostat_is_open:
-            found |= {"thermostat": self.thermostat_kind}
-            if self.thermostat_kind == "langevin":
-                translation, rotation = self.frictions
-                found |= {"friction_translation_per_ps": translation, "friction_rotation_per_ps": rotation}
-            else:
-                found |= {"thermostat_time_ps": self.thermostat_time}
+            found |= {"thermostat": self.thermostat_kind} | self.thermostat_values
         if self.has_barostat:
-            found |= {"compressibility_per_bar": self.compressibility}
-            if self.barostat_kind:
-                found |= {"barostat": self.barostat_kind, "barostat_interval_ps": self.barostat_interval}
-            if self.barostat_kind != "monte_carlo":
-                found |= {"barostat_time_ps": self.barostat_time}
+            named = {"barostat": self.barostat_kind} if self.ensemble == "npt" else {}
+            found |= named | {"compressibility_per_bar": self.compressibility} | self.barostat_values
         return self.model_copy(update=found)
-
-    @property
-    def scheme(self) -> Scheme:
-        """The integrator with its rotor."""
-        return (SCHEMES | WITH_THERMOSTAT)[self.integrator].with_rotor(self.rotor)
 
     @property
     def label(self) -> str:
@@ -298,12 +251,24 @@ class Stage(Section):
     @property
     def thermostat_kind(self) -> str:
         """The thermostat, or an empty text."""
-        return (self.thermostat or "velocity_rescaling") if self.has_thermostat else ""
+        return (self.thermostat or DEFAULT) if self.has_thermostat else ""
 
     @property
     def barostat_kind(self) -> str:
-        """The barostat of npt, or an empty text."""
-        return (self.barostat or "cell_rescaling") if self.ensemble == "npt" else ""
+        """The barostat, or an empty text."""
+        allowed = [name for name, kind in BAROSTATS.items() if self.ensemble in kind.ensembles]
+        return (self.barostat or allowed[0]) if allowed else ""
+
+    @property
+    def thermostat_values(self) -> Values:
+        """The keys of the thermostat with their values."""
+        return THERMOSTATS[self.thermostat_kind].values(self)
+
+    @property
+    def barostat_values(self) -> Values:
+        """The keys of the barostat with their values."""
+        keys = BAROSTATS[self.barostat_kind].keys
+        return {key: getattr(self, key) or default_of(default, self) for key, default in keys.items()}
 
     @property
     def temperatures(self) -> tuple[float, float]:
@@ -314,15 +279,12 @@ class Stage(Section):
     @property
     def thermostat_time(self) -> float:
         """Time constant of the thermostat, ps; the longer one of langevin."""
-        if self.thermostat_kind == "langevin":
-            return 1 / min(self.frictions)
-        return self.thermostat_time_ps or THERMOSTAT_TIMES[self.thermostat_kind]
+        return THERMOSTATS[self.thermostat_kind].time(self.thermostat_values)
 
     @property
-    def frictions(self) -> tuple[float, float]:
-        """Friction on translation and rotation, 1/ps."""
-        translation = self.friction_translation_per_ps or FRICTION
-        return translation, self.friction_rotation_per_ps or translation
+    def frictions(self) -> tuple[float, ...]:
+        """Friction of langevin on translation and rotation, 1/ps."""
+        return tuple(THERMOSTATS["langevin"].values(self).values())
 
     @property
     def pressures(self) -> tuple[Six, Six]:
@@ -340,16 +302,12 @@ class Stage(Section):
 
     @property
     def barostat_time(self) -> float:
-        return self.barostat_time_ps or BAROSTAT_TIME
-
-    @property
-    def barostat_interval(self) -> float:
-        return self.barostat_interval_ps or self.barostat_time / MOVES_PER_TIME
+        return self.barostat_time_ps or TIME
 
     @property
     def moves_every(self) -> int:
         """Steps between two moves of the box."""
-        return max(1, round(self.barostat_interval * 1000 / self.timestep_fs))
+        return max(1, round(self.barostat_values["barostat_interval_ps"] * 1000 / self.timestep_fs))
 
     @property
     def compressibility(self) -> float:
@@ -358,7 +316,19 @@ class Stage(Section):
     @property
     def keeps_momentum(self) -> bool:
         """Whether the thermostat conserves the total momentum."""
-        return self.thermostat_kind not in ("langevin", "andersen")
+        return not self.has_thermostat or not THERMOSTATS[self.thermostat_kind].on_molecules
+
+
+def _users(key: str) -> set[str]:
+    """The ensembles, thermostats and barostats that use a key; none for the keys of every stage."""
+    kinds = {name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys}
+    return USED.get(key, set()) | kinds
+
+
+def _ensembles(users: set[str]) -> set[str]:
+    """The ensembles in which thermostats, barostats or ensembles can be."""
+    of_barostats = {ensemble for name in users & set(BAROSTATS) for ensemble in BAROSTATS[name].ensembles}
+    return users | of_barostats | ({"nvt", "npt"} if users & set(THERMOSTATS) else set())
 
 
 def _tensor(given: Any) -> Six:

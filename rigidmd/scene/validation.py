@@ -2,12 +2,12 @@
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from math import isfinite
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, ValidationInfo, model_validator
+from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.toml import line_of, shorten_repr, shorten_text
 from rigidmd.errors import MOST_SHOWN
@@ -48,6 +48,30 @@ class Section(BaseModel):
 
 #: A name or a path, without line ends and other control characters.
 Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
+
+
+class NameIn:
+    """Annotation of a text that is a name in a table, which is read anew at each validation. Its JSON schema lists the
+    names."""
+
+    def __init__(self, names: Collection[str]):
+        self.names = names
+
+    def known(self, info: ValidationInfo) -> Collection[str]:
+        return self.names
+
+    def _check(self, name: Any, info: ValidationInfo) -> str:
+        known = self.known(info)
+        if not isinstance(name, str) or name not in known:
+            *first, last = [repr(other) for other in known]
+            raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}"})
+        return name
+
+    def __get_pydantic_core_schema__(self, source, handler):
+        return core_schema.with_info_plain_validator_function(self._check)
+
+    def __get_pydantic_json_schema__(self, schema, handler):
+        return {"enum": list(self.names), "type": "string"}
 
 
 def not_none(value: T | None) -> T:

@@ -25,7 +25,7 @@ from rigidmd.core.state import (
     State,
     no_load,
 )
-from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, Piston, barostat_workspace
+from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
 from rigidmd.dynamics.model import Model
@@ -127,7 +127,7 @@ class CpuEngine(Engine):
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
         integrator = _as_scheme(integrator)
-        return np.zeros(getattr(integrator.thermostat, "variables", 0) + isinstance(integrator.barostat, Piston))
+        return np.zeros(sum(getattr(flow, "variables", 0) for flow in (integrator.thermostat, integrator.barostat)))
 
     def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         integrator = _as_scheme(integrator)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.integrators import Scheme
+from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.state import State
 from rigidmd.core.statistics import ENERGY_ERROR
 from rigidmd.errors import SimulationError
@@ -19,7 +19,7 @@ from rigidmd.run.pilot.energy_walk import EnergyWalk, measure_energy_walk
 from rigidmd.run.pilot.trials import Trial, TrialSystem, final_state, measure_errors, state_difference
 
 #: Tried in this order. A later one is abandoned at a step that is too long and costs more.
-CANDIDATES = ("srkn_4", "two_stage", "velocity_verlet", "pefrl", "srkn_6", "suzuki_4", "kahan_li_6", "kahan_li_8")
+CANDIDATES = sorted((name for name, scheme in SCHEMES.items() if scheme.auto), key=lambda name: SCHEMES[name].auto)
 #: Most trials of each, how much its longest step is shortened at most, and the least gain for another trial.
 MAX_TRIALS, MAX_SHORTENING, MIN_GAIN = 16, 4096, 1.1
 #: Most halvings of the reference's step.

@@ -40,9 +40,8 @@ PILOT_PART, LEAST_SPAN = 0.01, 3.0
 COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
 
 
-def _on_rotor(name: str, rotor: str | None) -> Scheme:
+def _on_rotor(scheme: Scheme, rotor: str | None) -> Scheme:
     """The scheme with the rotor of the scene if it supports it."""
-    scheme = SCHEMES[name]
     return scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
 
 
@@ -90,7 +89,10 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
 
     return TrialSystem(
         name=system.scene.name, state=state,
-        methods={name: Method(lambda: system.engine(), _on_rotor(name, rotor)) for name in SCHEMES},
+        methods={
+            name: Method(lambda: system.engine(), _on_rotor(scheme, rotor))
+            for name, scheme in system.scene.schemes.items()
+        },
         energy=lambda engine, now: observe(system, engine, now, energy_unit=1.0).conserved,
         energy_unit="kT per degree of freedom", energy_note=f", at the {thermal / BOLTZMANN:.3g} K of the start",
         energy_size=freedom * thermal or 1.0, kinetic=kinetic or 1.0, span=span, time_unit="fs", time_size=FEMTOSECOND,
@@ -123,7 +125,7 @@ def body_trial_system(
     keys = ("rotor", "formulation", "relative_tolerance", "absolute_tolerance", "energy_error", "trajectory_error")
     plain = dict.fromkeys(keys)
     fits, refused = {}, {}
-    for name in (*SCHEMES, *COMPARATORS):
+    for name in (*scene.schemes, *COMPARATORS):
         solver, form = COMPARATORS.get(name, (name, "matrix"))
         formulation = None if form == "matrix" else form
         try:
@@ -149,15 +151,16 @@ def body_trial_system(
         seen = motion(system, [start, Snapshot(float(state.time[0]), state)])
         return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
 
+    schemes = {name: _on_rotor(scheme, run.rotor) for name, scheme in scene.schemes.items()}
     methods = {
-        name: Method(
-            fit.engine, fit.method._replace(duration=whole) if name in COMPARATORS else _on_rotor(name, run.rotor)
-        )
+        name: Method(fit.engine, schemes[name] if name in schemes else fit.method._replace(duration=whole))
         for name, fit in fits.items()
     }
-    schemes = [name for name in fits if name in SCHEMES]
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
-    reference = max(schemes, key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations))
+    reference = max(
+        (name for name in fits if name in SCHEMES),
+        key=lambda name: (SCHEMES[name].order, -SCHEMES[name].force_evaluations),
+    )
     trial_system = TrialSystem(
         name=scene.name, state=system.state, methods=methods, energy=energy,
         energy_unit="times the largest kinetic energy", energy_note="", energy_size=kinetic, kinetic=kinetic,

@@ -12,11 +12,12 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 
-#: Default integrators: velocity Verlet, the best of each kind, and for a body the textbook solvers.
+#: Default integrators besides those of [[integrators]]: velocity Verlet, the best of each kind, and for a body the
+#: textbook solvers.
 DEFAULT_INTEGRATORS = (
-    "velocity_verlet", "two_stage", "suzuki_4", "pefrl", "chin_4a", "srkn_4", "kahan_li_6", "srkn_6", "kahan_li_8",
+    *(name for name, scheme in SCHEMES.items() if scheme.is_default),
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
-)  # fmt: skip
+)
 #: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 #: Rotation of a spinning body per force evaluation in the middle of the ladder, rad.
@@ -43,7 +44,7 @@ def measure_accuracy(
     Molecules start where the last stage starts, after the earlier stages have run; no thermostat acts.
     """
     check_engine_is_rigidmd(scene)
-    known = (*SCHEMES, *COMPARATORS)
+    known = (*scene.schemes, *COMPARATORS)
     integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
         errors = [
@@ -67,6 +68,7 @@ def measure_accuracy(
     if not integrators:
         is_body = isinstance(scene, BodyScene)
         defaults = [name for name in DEFAULT_INTEGRATORS if is_body or name in SCHEMES]
+        defaults += [row.name for row in scene.integrators]
         left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
         left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
         of_scene = _method_name(scene.run.integrator if is_body else scene.stages[-1].integrator, scene)
@@ -101,12 +103,11 @@ def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSyste
     simulation, state = start_of_last_stage(scene)
     trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
     trial_system.rounding = single_precision_errors(simulation.system, state)
-    evaluations = SCHEMES[last.integrator].force_evaluations if last.integrator in SCHEMES else 1
-    return trial_system, last.timestep_fs / evaluations
+    return trial_system, last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
 
 
 def _of_body(scene: BodyScene, span: float | None) -> tuple[TrialSystem, float]:
     """As `_of_molecules`, in s."""
     trial_system, speed = body_trial_system(scene, span)
-    evaluations = SCHEMES[scene.run.integrator].force_evaluations if scene.run.integrator in SCHEMES else 1
+    evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
     return trial_system, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations

@@ -1,11 +1,11 @@
 """`rigidmd accuracy --averages`: samples the last stage of a scene by several methods and steps, for their biases."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import floor, inf, log10, nan
 
 import numpy as np
 
-from rigidmd.core.integrators import SCHEMES, WITH_THERMOSTAT
+from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.momenta import remove_momentum
@@ -14,14 +14,14 @@ from rigidmd.run import Simulation
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.stage import ERROR_TARGETS, THERMOSTAT_TIMES, Stage
+from rigidmd.scene.stage import ERROR_TARGETS, Stage
+from rigidmd.scene.thermostats import THERMOSTATS
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.bias import AveragedQuantity, AverageRun, Averages
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Measured besides the method of the stage when no methods are given.
 DEFAULT_METHODS = ("baoab+langevin", "velocity_verlet+velocity_rescaling", "velocity_verlet+nose_hoover")
-THERMOSTATS = ("langevin", *THERMOSTAT_TIMES)
 #: Time steps, in units of the longest stable step.
 LADDER = (0.15, 0.3, 0.45, 0.6, 0.75)
 #: Time steps, in units of the scene's, where the longest stable step is unknown.
@@ -57,7 +57,8 @@ def measure_averages(
         raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
-    pairs = [_parse_method(name, stage) for name in methods or DEFAULT_METHODS]
+    schemes = scene.schemes | WITH_THERMOSTAT
+    pairs = [_parse_method(name, stage, schemes) for name in methods or DEFAULT_METHODS]
     if not methods:
         of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
         pairs = list(dict.fromkeys([*of_stage, *pairs]))
@@ -71,7 +72,7 @@ def measure_averages(
     found = stiffest_mode(simulation.system, state)
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in pairs:
-        scheme = (SCHEMES | WITH_THERMOSTAT)[integrator]
+        scheme = schemes[integrator]
         if timesteps:
             steps = list(timesteps)
         elif found is None:
@@ -140,10 +141,9 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
     return stage
 
 
-def _parse_method(text: str, stage: Stage) -> tuple[str, str]:
+def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, str]:
     """Integrator and thermostat of "integrator+thermostat"; default: Langevin for baoab, else the stage's."""
     integrator, _, thermostat = (part.strip() for part in text.partition("+"))
-    known = (*SCHEMES, *WITH_THERMOSTAT)
     if integrator not in known:
         error = f"unknown integrator {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"
         raise SceneError("--integrators", [error])

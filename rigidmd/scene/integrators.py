@@ -1,0 +1,147 @@
+"""Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by `integrator`."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, PrivateAttr, Strict, ValidationError, ValidationInfo
+
+from rigidmd.core.integrators import (
+    AUTO,
+    SCHEMES,
+    SOLVERS,
+    WITH_THERMOSTAT,
+    Rotor,
+    Scheme,
+    composed,
+    measured_order,
+    split,
+)
+from rigidmd.core.toml import plain_values
+from rigidmd.errors import SceneError
+from rigidmd.scene.validation import Line, NameIn, Section, validation_messages
+
+RESERVED = (*SCHEMES, *WITH_THERMOSTAT, AUTO, *SOLVERS)
+Coefficient = Annotated[float, Strict(), Field(ge=-10, le=10)]
+Coefficients = Annotated[tuple[Coefficient, ...], Field(min_length=1, max_length=1000)]
+#: Largest difference of the order that is measured for an oscillator from the order that a row states.
+ORDER_TOLERANCE = 0.5
+
+
+class IntegratorRow(Section):
+    """An integrator as a row of coefficients, for stages and for `rigidmd accuracy`."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$", max_length=60)]
+    """Name for stages, [run] of a body and --integrators"""
+    steps: Coefficients | None = None
+    """Lengths of successive velocity Verlet steps, as fractions of the time step; such a row works with any rotor"""
+    kicks: Coefficients | None = None
+    """Instead of steps: fractions of the kicks, of which the first and the last may be 0; needs the exact rotor"""
+    drifts: Coefficients | None = None
+    """Fractions of the drifts between the kicks, one fewer than kicks"""
+    gradients: Coefficients | None = None
+    """Coefficients of the force gradient of each kick, in squares of the time step; default: none"""
+    order: Annotated[int, Strict(), Field(ge=2, le=20)]
+    """Order of convergence; it is compared with the order for an anharmonic oscillator"""
+    source: Line = ""
+    """Where the coefficients are from"""
+
+    def _errors(self):
+        if self.name in RESERVED:
+            yield f"name: {self.name} is an integrator of rigidmd; choose another name"
+        if (self.steps is None) == (self.kicks is None or self.drifts is None):
+            yield "needs steps, or kicks and drifts"
+        elif self.steps is not None and (self.kicks or self.drifts or self.gradients):
+            yield "steps and kicks, drifts or gradients contradict each other: omit one"
+        else:
+            try:
+                order = measured_order(self.scheme)
+            except ValueError as error:
+                yield str(error).partition("; odd")[0]
+            else:
+                if order < self.order - ORDER_TOLERANCE:
+                    yield f"order = {self.order}, but the error of an oscillator has order {order:.1f}"
+
+    @property
+    def scheme(self) -> Scheme:
+        """Raises ValueError if kicks or drifts do not sum to 1, or the row is not a palindrome."""
+        if self.steps is not None:
+            return composed(self.name, self.steps, self.order, self.source)
+        return split(self.name, self.kicks or (), self.drifts or (), self.order, self.source, self.gradients)
+
+
+#: Rows that Python has registered in this process.
+_REGISTERED: dict[str, IntegratorRow] = {}
+
+
+def integrator(
+    name: str, *, order: int, steps: Sequence[float] | None = None, kicks: Sequence[float] | None = None,
+    drifts: Sequence[float] | None = None, gradients: Sequence[float] | None = None, source: str = "",
+) -> str:  # fmt: skip
+    """Make a row of coefficients an integrator, and return its name, which scenes then accept.
+
+    rigidmd.integrator("ruth_4", order=4, steps=[1.3512, -1.7024, 1.3512], source="Forest & Ruth 1990")
+
+    steps : lengths of successive velocity Verlet steps, as fractions of the time step; or
+    kicks, drifts : fractions of kick, drift, ..., drift, kick; gradients : of each kick, see `core.integrators.Flow`
+
+    Fractions sum to 1 and read the same from both ends. A scene that names the row keeps its coefficients in its table
+    [[integrators]], so that its file and the folder of its run are complete. Raises SceneError.
+    """
+    given = {"name": name, "order": order, "steps": steps, "kicks": kicks, "drifts": drifts, "gradients": gradients}
+    table = {key: value for key, value in plain_values(given | {"source": source}).items() if value is not None}
+    try:
+        _REGISTERED[name] = IntegratorRow.model_validate(table)
+    except ValidationError as error:
+        faults = [fault.removeprefix("scene: ") for fault in validation_messages(error, IntegratorRow)]
+        raise SceneError(f"integrator {name!r:.60}", faults) from None
+    return name
+
+
+def with_registered_rows(data: dict[str, Any]) -> dict[str, Any]:
+    """Tables of a scene with those registered rows that it names and does not have."""
+    there, stages = data.get("integrators", []), data.get("stages", [])
+    if not (_REGISTERED and isinstance(there, list) and isinstance(stages, list)):
+        return data
+    names = dict.fromkeys(table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict))
+    taken = [table.get("name") for table in there if isinstance(table, dict)]
+    rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
+    return data | {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else data
+
+
+class IntegratorKey(NameIn):
+    """Annotation of the name of an integrator: one of these names, or of a row in [[integrators]]."""
+
+    def known(self, info: ValidationInfo):
+        return (*self.names, *(info.context or ()))
+
+
+class MovedByScheme(Section):
+    """A section with the keys `integrator` and `rotor`."""
+
+    if TYPE_CHECKING:
+        integrator: str
+        rotor: Rotor | None
+
+    _user_schemes: dict[str, Scheme] = PrivateAttr(default_factory=dict)
+
+    def model_post_init(self, context: Any) -> None:
+        self._user_schemes = context or {}
+
+    @property
+    def row(self) -> Scheme:
+        """The row of the integrator, with the rotor that it needs."""
+        return (SCHEMES | WITH_THERMOSTAT | self._user_schemes)[self.integrator]
+
+    @property
+    def scheme(self) -> Scheme:
+        """The integrator with its rotor."""
+        return self.row.with_rotor(self.rotor)
+
+    @property
+    def has_scheme(self) -> bool:
+        """Whether the integrator is a row of flows: neither "auto" nor an ODE solver."""
+        return self.integrator not in (AUTO, *SOLVERS)
+
+    def _rotor_errors(self):
+        if self.rotor == "split" and self.has_scheme and self.row.exact_rotor:
+            yield f"{self.integrator} needs rotor = 'exact': with the split rotor it would be of order 2"
