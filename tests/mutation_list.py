@@ -119,8 +119,8 @@ RINGS = [
     Mutation(
         "B2", "Monte Carlo barostat: N + 1 in the rule of acceptance",
         "dynamics/barostats.py",
-        "            return barostat.molecules * log(after / before)",
-        "            return (barostat.molecules + 1) * log(after / before)",
+        "    return barostat.molecules * log(after / before)",
+        "    return (barostat.molecules + 1) * log(after / before)",
         (
             "test_wiring.py::test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecules",
             "test_changing_cells.py::test_an_ideal_gas_has_its_volumes_through_a_whole_run",

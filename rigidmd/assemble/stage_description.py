@@ -1,8 +1,7 @@
 """Descriptions of stages: steps, thermostat and barostat, sampled distribution, conserved quantities."""
 
-from rigidmd.scene.barostats import BAROSTATS, COMPRESSIBILITY
+from rigidmd.scene.couplings import BAROSTATS, COMPRESSIBILITY, THERMOSTATS
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.thermostats import THERMOSTATS
 from rigidmd.units import FEMTOSECOND
 
 #: Range of compressibilities (1/bar): diamond, a gas at 0.01 bar.

@@ -9,8 +9,8 @@ from rigidmd.dynamics.momenta import mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp, VelocityRescaling, constant_ramp
 from rigidmd.engines.system import System
-from rigidmd.scene import barostats, thermostats
-from rigidmd.scene.barostats import Six
+from rigidmd.scene import couplings
+from rigidmd.scene.couplings import Six
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 
@@ -26,7 +26,7 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     elif (
         thermostat is None
         and not stage.has_barostat
-        and any(other.thermostat_kind == thermostats.DEFAULT for other in scene.stages)
+        and any(other.thermostat_kind == couplings.DEFAULT_THERMOSTAT for other in scene.stages)
     ):
         # An idle thermostat, so that all stages run the same machine code.
         thermostat = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
@@ -34,7 +34,7 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
         found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
     if stage.has_barostat:
         barostat = barostat_of(system, k)
-        in_steps = barostats.BAROSTATS[stage.barostat_kind].in_verlet_steps
+        in_steps = couplings.BAROSTATS[stage.barostat_kind].in_verlet_steps
         found = found.with_piston(barostat) if in_steps else found.with_barostat(barostat, stage.moves_every)
     if system.keeps_momentum_in(k) and (interval := system.removes_momentum_every) is not None:
         found = found.with_momentum_removal(max(1, round(interval / (stage.timestep_fs * FEMTOSECOND))))

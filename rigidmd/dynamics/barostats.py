@@ -129,7 +129,7 @@ def _piston(stage, given: Confinement) -> Piston:
     return Piston(given.pressure, inverse_mass, given.tail)
 
 
-#: Name of a barostat in `scene.barostats` -> the function that makes it for a stage.
+#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage.
 BAROSTATS = {"cell_rescaling": _cell_rescaling, "monte_carlo": _volume_moves, "piston": _piston}
 
 
@@ -206,19 +206,17 @@ def compute_load_and_virial(terms, state, load, workspace, which):
 
 @implements(scale_box)
 def _scale_box(barostat, state, h):
-    if not is_a(barostat, Piston):
-        return lambda barostat, state, h: None
+    return _move_piston if is_a(barostat, Piston) else lambda barostat, state, h: None
 
-    def scale_box(barostat, state, h):
-        volume = volume_of(state.cell)
-        after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
-        scale = (after / volume) ** (1 / 3)
-        scale_array(state.position, scale)
-        scale_array(state.velocity, 1 / scale)
-        scale_array(state.cell, scale)
-        state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
 
-    return scale_box
+def _move_piston(barostat, state, h):
+    volume = volume_of(state.cell)
+    after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
+    scale = (after / volume) ** (1 / 3)
+    scale_array(state.position, scale)
+    scale_array(state.velocity, 1 / scale)
+    scale_array(state.cell, scale)
+    state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
 
 
 @implements(apply_barostat, Piston)
@@ -237,41 +235,54 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
     return OK
 
 
+def propose_strain(barostat, model, state, workspace, h, draw):
+    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
+    raise TypeError("compiled code only")
+
+
+def rescale_velocities(barostat, state, workspace):
+    """Change the velocities with the strain, unless the barostat keeps them."""
+    raise TypeError("compiled code only")
+
+
+def log_acceptance(barostat, model, state, workspace, h):
+    """The logarithm of the acceptance probability of a move that has been made."""
+    raise TypeError("compiled code only")
+
+
 @implements(apply_barostat)
 def _apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
     if is_a(barostat, NoBarostat):
         return lambda barostat, model, terms, state, load, workspace, progress, h, draw: OK
-    if is_a(barostat, Piston):
-        return None
+    return None if is_a(barostat, Piston) else _try_move
 
-    def try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
-        if progress[2] == 0:
-            if progress[1] != 1 or workspace.known[0] == 0:
-                progress[1] = 0
-                status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
-                if status != OK:
-                    return status
-                progress[1] = 1
-            propose_strain(barostat, model, state, workspace, h, draw)
-            save_before_move(state, load, workspace)
-            apply_strain(barostat, state, workspace)
-            progress[2] = 1
-        status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
-        if status != OK:
-            return status
-        progress[2] = 0
-        chance = log_acceptance(barostat, model, state, workspace, h)
-        u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
-        workspace.counts[0] += 1
-        if log(u) < chance:
-            workspace.counts[1] += 1
-            state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
-        else:
-            undo_move(state, load, workspace)
-            terms.tallies_valid[0] = 0
-        return OK
 
-    return try_move
+def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
+    if progress[2] == 0:
+        if progress[1] != 1 or workspace.known[0] == 0:
+            progress[1] = 0
+            status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
+            if status != OK:
+                return status
+            progress[1] = 1
+        propose_strain(barostat, model, state, workspace, h, draw)
+        save_before_move(state, load, workspace)
+        apply_strain(barostat, state, workspace)
+        progress[2] = 1
+    status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
+    if status != OK:
+        return status
+    progress[2] = 0
+    chance = log_acceptance(barostat, model, state, workspace, h)
+    u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
+    workspace.counts[0] += 1
+    if log(u) < chance:
+        workspace.counts[1] += 1
+        state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
+    else:
+        undo_move(state, load, workspace)
+        terms.tallies_valid[0] = 0
+    return OK
 
 
 @kernel(inline=True)
@@ -281,60 +292,38 @@ def target_pressure(pressure, state, k):
     return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction
 
 
-@kernel
-def save_before_move(state, load, workspace):
-    copy(state.position, workspace.position)
-    copy(state.velocity, workspace.velocity)
-    copy(load.force, workspace.load.force)
-    copy(load.torque_body, workspace.load.torque_body)
-    copy(workspace.tally[:1], workspace.tally[1:])
-    copy(state.cell, workspace.cell)
+@implements(propose_strain, VolumeMoves)
+def propose_volume(barostat, model, state, workspace, h, draw):
+    u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
+    volume = volume_of(state.cell)
+    workspace.strain[0] = 0.0
+    for k in range(3):
+        workspace.strain[0, k] = log(max(1 + (2 * u - 1) * barostat.width / volume, 0.1)) / 3
+    set_matrices(workspace)
 
 
-@kernel
-def undo_move(state, load, workspace):
-    copy(workspace.position, state.position)
-    copy(workspace.velocity, state.velocity)
-    copy(workspace.load.force, load.force)
-    copy(workspace.load.torque_body, load.torque_body)
-    copy(workspace.tally[1:], workspace.tally[:1])
-    copy(workspace.cell, state.cell)
+@implements(rescale_velocities, VolumeMoves)
+def keep_velocities(barostat, state, workspace):
+    return None
 
 
-def propose_strain(barostat, model, state, workspace, h, draw):
-    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
-    raise TypeError("compiled code only")
+@implements(log_acceptance, VolumeMoves)
+def log_acceptance_of_volume(barostat, model, state, workspace, h):
+    before, after = volume_of(workspace.cell), volume_of(state.cell)
+    work = target_pressure(barostat.pressure, state, 0) * (after - before)
+    work = energy_gained(barostat, model, state, workspace) + work
+    return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
 
 
-def log_acceptance(barostat, model, state, workspace, h):
-    """The logarithm of the acceptance probability of a move that has been made."""
-    raise TypeError("compiled code only")
-
-
-@implements(propose_strain)
-def _propose(barostat, model, state, workspace, h, draw):
-    if is_a(barostat, VolumeMoves):
-
-        def propose_volume(barostat, model, state, workspace, h, draw):
-            u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
-            volume = volume_of(state.cell)
-            workspace.strain[0] = 0.0
-            for k in range(3):
-                workspace.strain[0, k] = log(max(1 + (2 * u - 1) * barostat.width / volume, 0.1)) / 3
-            set_matrices(workspace)
-
-        return propose_volume
-
-    def propose_strain(barostat, model, state, workspace, h, draw):
-        drift(barostat, model, state, workspace, h, workspace.strain[1], workspace.strain[2])
-        for c in range(6):
-            xi, _ = normals(barostat.key, draw + c, 0, state.step[NOW])
-            for k in range(6):
-                if barostat.coordinate[k] == c:
-                    workspace.strain[0, k] = workspace.strain[1, k] + sqrt(workspace.strain[2, k]) * xi
-        set_matrices(workspace)
-
-    return propose_strain
+@implements(propose_strain, CellRescaling)
+def propose_rescaling(barostat, model, state, workspace, h, draw):
+    drift(barostat, model, state, workspace, h, workspace.strain[1], workspace.strain[2])
+    for c in range(6):
+        xi, _ = normals(barostat.key, draw + c, 0, state.step[NOW])
+        for k in range(6):
+            if barostat.coordinate[k] == c:
+                workspace.strain[0, k] = workspace.strain[1, k] + sqrt(workspace.strain[2, k]) * xi
+    set_matrices(workspace)
 
 
 @kernel
@@ -366,6 +355,70 @@ def strain_force(barostat, model, state, workspace, k, volume, thermal):
     if k < 3:
         total += barostat.tail[1] / volume + barostat.at_rest[k] * thermal
     return total
+
+
+@implements(rescale_velocities, CellRescaling)
+def divide_velocities(barostat, state, workspace):
+    inverse = workspace.matrices[1]
+    for m in range(len(state.velocity)):
+        x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
+        state.velocity[m, 0] = inverse[0, 0] * x
+        state.velocity[m, 1] = inverse[1, 0] * x + inverse[1, 1] * y
+        state.velocity[m, 2] = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
+
+
+@implements(log_acceptance, CellRescaling)
+def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
+    before, after = volume_of(workspace.cell), volume_of(state.cell)
+    matrix, inverse = workspace.matrices[0], workspace.matrices[1]
+    there, back = workspace.strain, np.zeros((2, 6))
+    drift(barostat, model, state, workspace, h, back[0], back[1])
+    mean = (
+        target_pressure(barostat.pressure, state, 0)
+        + target_pressure(barostat.pressure, state, 1)
+        + target_pressure(barostat.pressure, state, 2)
+    ) / 3
+    work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
+    chance = log(after / before)
+    used = -1
+    for k in range(6):
+        if barostat.coordinate[k] < 0:
+            continue
+        i, j = COMPONENTS[k]
+        turn = there[0, k]
+        turn_back = -turn if k < 3 else inverse[i, j]
+        deviation = target_pressure(barostat.pressure, state, k) - (mean if k < 3 else 0.0)
+        work += deviation * 0.5 * (before + after) * 0.5 * (turn - turn_back)
+        if k < 3:
+            chance += barostat.at_rest[k] * turn
+        if barostat.coordinate[k] > used:  # coordinates are numbered in the order of their first component
+            used = barostat.coordinate[k]
+            chance += 0.5 * (turn - there[1, k]) ** 2 / there[2, k] + 0.5 * log(there[2, k])
+            chance -= 0.5 * (turn_back - back[0, k]) ** 2 / back[1, k] + 0.5 * log(back[1, k])
+    if barostat.coordinate[3] >= 0:
+        # densities of T and of its inverse in the left invariant measure of lower triangular matrices
+        chance -= 2 * (log(matrix[1, 1]) + 2 * log(matrix[2, 2]))
+    return chance - work / ramp_value(barostat.thermal_energy, state)
+
+
+@kernel
+def save_before_move(state, load, workspace):
+    copy(state.position, workspace.position)
+    copy(state.velocity, workspace.velocity)
+    copy(load.force, workspace.load.force)
+    copy(load.torque_body, workspace.load.torque_body)
+    copy(workspace.tally[:1], workspace.tally[1:])
+    copy(state.cell, workspace.cell)
+
+
+@kernel
+def undo_move(state, load, workspace):
+    copy(workspace.position, state.position)
+    copy(workspace.velocity, state.velocity)
+    copy(workspace.load.force, load.force)
+    copy(workspace.load.torque_body, load.torque_body)
+    copy(workspace.tally[1:], workspace.tally[:1])
+    copy(workspace.cell, state.cell)
 
 
 @kernel
@@ -402,27 +455,6 @@ def multiply_rows(rows, matrix):
         rows[m, 2] = z * matrix[2, 2]
 
 
-def rescale_velocities(barostat, state, workspace):
-    """Change the velocities with the strain, unless the barostat keeps them."""
-    raise TypeError("compiled code only")
-
-
-@implements(rescale_velocities)
-def _rescale_velocities(barostat, state, workspace):
-    if is_a(barostat, VolumeMoves):
-        return lambda barostat, state, workspace: None
-
-    def contravariant(barostat, state, workspace):
-        inverse = workspace.matrices[1]
-        for m in range(len(state.velocity)):
-            x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
-            state.velocity[m, 0] = inverse[0, 0] * x
-            state.velocity[m, 1] = inverse[1, 0] * x + inverse[1, 1] * y
-            state.velocity[m, 2] = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
-
-    return contravariant
-
-
 @kernel
 def energy_gained(barostat, model, state, workspace):
     """Change of potential and kinetic energy by the move (u Å²/ps²), with dispersion beyond the cutoff."""
@@ -433,50 +465,3 @@ def energy_gained(barostat, model, state, workspace):
             squares = state.velocity[m, k] ** 2 - workspace.velocity[m, k] ** 2
             gained += 0.5 * model.mass[model.species[m]] * squares
     return gained
-
-
-@implements(log_acceptance)
-def _log_acceptance(barostat, model, state, workspace, h):
-    if is_a(barostat, VolumeMoves):
-
-        def of_volume(barostat, model, state, workspace, h):
-            before, after = volume_of(workspace.cell), volume_of(state.cell)
-            work = target_pressure(barostat.pressure, state, 0) * (after - before)
-            work = energy_gained(barostat, model, state, workspace) + work
-            return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
-
-        return of_volume
-
-    def of_strain(barostat, model, state, workspace, h):
-        before, after = volume_of(workspace.cell), volume_of(state.cell)
-        matrix, inverse = workspace.matrices[0], workspace.matrices[1]
-        there, back = workspace.strain, np.zeros((2, 6))
-        drift(barostat, model, state, workspace, h, back[0], back[1])
-        mean = (
-            target_pressure(barostat.pressure, state, 0)
-            + target_pressure(barostat.pressure, state, 1)
-            + target_pressure(barostat.pressure, state, 2)
-        ) / 3
-        work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
-        chance = log(after / before)
-        used = -1
-        for k in range(6):
-            if barostat.coordinate[k] < 0:
-                continue
-            i, j = COMPONENTS[k]
-            turn = there[0, k]
-            turn_back = -turn if k < 3 else inverse[i, j]
-            deviation = target_pressure(barostat.pressure, state, k) - (mean if k < 3 else 0.0)
-            work += deviation * 0.5 * (before + after) * 0.5 * (turn - turn_back)
-            if k < 3:
-                chance += barostat.at_rest[k] * turn
-            if barostat.coordinate[k] > used:  # coordinates are numbered in the order of their first component
-                used = barostat.coordinate[k]
-                chance += 0.5 * (turn - there[1, k]) ** 2 / there[2, k] + 0.5 * log(there[2, k])
-                chance -= 0.5 * (turn_back - back[0, k]) ** 2 / back[1, k] + 0.5 * log(back[1, k])
-        if barostat.coordinate[3] >= 0:
-            # densities of T and of its inverse in the left invariant measure of lower triangular matrices
-            chance -= 2 * (log(matrix[1, 1]) + 2 * log(matrix[2, 2]))
-        return chance - work / ramp_value(barostat.thermal_energy, state)
-
-    return of_strain

@@ -98,7 +98,7 @@ class NoseHoover(NamedTuple):
         return 4 * self.links
 
 
-#: Name of a thermostat in `scene.thermostats` -> the function that makes it for a stage, from kB T, the degrees of
+#: Name of a thermostat in `scene.couplings` -> the function that makes it for a stage, from kB T, the degrees of
 #: freedom and the key of its random numbers.
 THERMOSTATS = {
     "velocity_rescaling": lambda stage, thermal, freedom, key: VelocityRescaling(

@@ -5,9 +5,18 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, auto_errors
-from rigidmd.scene.barostats import BAROSTATS, COMPRESSIBILITY, TIME, BarostatKeys, Six
+from rigidmd.scene.couplings import (
+    BAROSTAT_TIME,
+    BAROSTATS,
+    COMPRESSIBILITY,
+    DEFAULT_THERMOSTAT,
+    THERMOSTATS,
+    BarostatKeys,
+    Six,
+    ThermostatKeys,
+    Values,
+)  # fmt: skip
 from rigidmd.scene.integrators import IntegratorKey, MovedByScheme
-from rigidmd.scene.thermostats import DEFAULT, THERMOSTATS, ThermostatKeys, Values, default_of
 from rigidmd.scene.validation import Count, Line, Positive, Section
 
 MOST_STEPS = 1e12
@@ -182,10 +191,10 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"barostat = {name!r} is for {' and '.join(kind.ensembles)}; {self.ensemble} has {', '.join(others)}"
             return
         several = isinstance(self.pressure_bar, tuple) and len(self.pressure_bar) > 2
-        if self.pressure_coupling not in kind.couplings or (several and kind.couplings == ("isotropic",)):
-            allowed = " or ".join(coupling.replace("_", "-") for coupling in kind.couplings)
+        if self.pressure_coupling not in kind.shapes or (several and kind.shapes == ("isotropic",)):
+            allowed = " or ".join(coupling.replace("_", "-") for coupling in kind.shapes)
             subject = f"barostat = {name!r}" if self.barostat else self.ensemble
-            better = [other for other in others if len(BAROSTATS[other].couplings) > len(kind.couplings)]
+            better = [other for other in others if len(BAROSTATS[other].shapes) > len(kind.shapes)]
             advice = f"; {better[0]} allows others" if better else ""
             yield f"{subject} allows only an {allowed} pressure{advice}"
         if kind.in_verlet_steps and self.has_scheme and self.row.exact_rotor:
@@ -251,7 +260,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def thermostat_kind(self) -> str:
         """The thermostat, or an empty text."""
-        return (self.thermostat or DEFAULT) if self.has_thermostat else ""
+        return (self.thermostat or DEFAULT_THERMOSTAT) if self.has_thermostat else ""
 
     @property
     def barostat_kind(self) -> str:
@@ -267,8 +276,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def barostat_values(self) -> Values:
         """The keys of the barostat with their values."""
-        keys = BAROSTATS[self.barostat_kind].keys
-        return {key: getattr(self, key) or default_of(default, self) for key, default in keys.items()}
+        return BAROSTATS[self.barostat_kind].values(self)
 
     @property
     def temperatures(self) -> tuple[float, float]:
@@ -302,7 +310,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def barostat_time(self) -> float:
-        return self.barostat_time_ps or TIME
+        return self.barostat_time_ps or BAROSTAT_TIME
 
     @property
     def moves_every(self) -> int:
@@ -321,14 +329,13 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
 def _users(key: str) -> set[str]:
     """The ensembles, thermostats and barostats that use a key; none for the keys of every stage."""
-    kinds = {name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys}
-    return USED.get(key, set()) | kinds
+    return USED.get(key, set()) | {name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys}
 
 
 def _ensembles(users: set[str]) -> set[str]:
-    """The ensembles in which thermostats, barostats or ensembles can be."""
-    of_barostats = {ensemble for name in users & set(BAROSTATS) for ensemble in BAROSTATS[name].ensembles}
-    return users | of_barostats | ({"nvt", "npt"} if users & set(THERMOSTATS) else set())
+    """The ensembles among users of a key, or in which the thermostats and barostats among them act."""
+    kinds = THERMOSTATS | BAROSTATS
+    return {ensemble for name in users for ensemble in (kinds[name].ensembles if name in kinds else (name,))}
 
 
 def _tensor(given: Any) -> Six:

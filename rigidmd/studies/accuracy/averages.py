@@ -14,8 +14,8 @@ from rigidmd.run import Simulation
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, Stage
-from rigidmd.scene.thermostats import THERMOSTATS
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.bias import AveragedQuantity, AverageRun, Averages
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL

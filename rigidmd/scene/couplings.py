@@ -1,0 +1,134 @@
+"""The thermostats and barostats of scenes: their names, keys and descriptions.
+
+Their flows are in `dynamics.thermostats` and `dynamics.barostats`, under the same names.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, NamedTuple, get_args
+
+from pydantic import Field, Strict
+
+from rigidmd.scene.validation import NameIn, Number, Positive, Section
+
+Values = dict[str, float]  # of keys
+Six = tuple[float, float, float, float, float, float]
+Shapes = Literal["isotropic", "semi_isotropic", "anisotropic", "flexible"]
+
+BAROSTAT_TIME = 1.0  # ps
+#: Moves of the box per barostat_time_ps.
+MOVES_PER_TIME = 20
+#: Compressibility of water at 298 K and 1 bar, 1/bar.
+COMPRESSIBILITY = 4.5e-5
+
+
+class Coupling(NamedTuple):
+    """What scenes and reports know of a thermostat or barostat."""
+
+    summary: str  # for the description of the key `thermostat` or `barostat`
+    source: str
+    keys: dict[str, float | Callable[[Any], float]]  # its keys -> their defaults, or functions of the stage
+    ensembles: tuple[str, ...] = ("nvt", "npt")
+    #: Of a thermostat: whether it acts on each molecule by itself, so that the total momentum is not conserved and
+    #: diffusion and spectra change; its time constant (ps) and its description by the values of its keys.
+    on_molecules: bool = False
+    time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
+    description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
+    #: Of a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
+    #: integrator then has to consist; its name in reports, if it is another one.
+    shapes: tuple[str, ...] = get_args(Shapes)
+    in_verlet_steps: bool = False
+    title: str = ""
+
+    def values(self, stage: Any) -> Values:
+        """The values of its keys in a stage."""
+        defaults = {key: default(stage) if callable(default) else default for key, default in self.keys.items()}
+        return {key: getattr(stage, key) or default for key, default in defaults.items()}
+
+
+def _describe_frictions(values: Values) -> str:
+    translation, rotation = values.values()
+    return f"friction {translation:g}/ps" + (f" ({rotation:g}/ps of rotation)" if rotation != translation else "")
+
+
+def _interval(stage: Any) -> float:
+    return (stage.barostat_time_ps or BAROSTAT_TIME) / MOVES_PER_TIME
+
+
+DEFAULT_THERMOSTAT = "velocity_rescaling"
+THERMOSTATS = {
+    "velocity_rescaling": Coupling(
+        "stochastic, by Bussi et al.", "Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101",
+        {"thermostat_time_ps": 0.1},
+    ),
+    "langevin": Coupling(
+        "friction and noise", "Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114",
+        {"friction_translation_per_ps": 1.0,
+         "friction_rotation_per_ps": lambda stage: stage.friction_translation_per_ps or 1.0},
+        on_molecules=True, time=lambda values: 1 / min(values.values()), description=_describe_frictions,
+    ),
+    "nose_hoover": Coupling(
+        "one chain for translation and one for rotation",
+        "Martyna, Tuckerman, Tobias & Klein 1996, Mol. Phys. 87, 1117",
+        {"thermostat_time_ps": 0.5, "nose_hoover_links": 3},
+    ),
+    "andersen": Coupling(
+        "collisions", "Andersen 1980, J. Chem. Phys. 72, 2384", {"thermostat_time_ps": 1.0}, on_molecules=True,
+    ),
+}  # fmt: skip
+#: The first one of an ensemble is its default.
+BAROSTATS = {
+    "cell_rescaling": Coupling(
+        "stochastic cell rescaling, made exact by a Metropolis test",
+        "Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107",
+        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval}, ("npt",),
+    ),
+    "monte_carlo": Coupling(
+        "random changes of the volume", "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
+        {"barostat_interval_ps": _interval}, ("npt",), shapes=("isotropic",),
+    ),
+    "piston": Coupling(
+        "a volume with inertia and without friction", "Andersen 1980, J. Chem. Phys. 72, 2384",
+        {"barostat_time_ps": BAROSTAT_TIME}, ("nph",), shapes=("isotropic",), in_verlet_steps=True, title="a piston",
+    ),
+}  # fmt: skip
+
+
+class ThermostatKeys(Section):
+    """The keys of thermostats in a stage."""
+
+    thermostat: Annotated[str, NameIn(THERMOSTATS)] | None = Field(
+        default=None,
+        description="; ".join(f"{name}: {kind.summary}" for name, kind in THERMOSTATS.items())
+        + f". Default: langevin with baoab, else {DEFAULT_THERMOSTAT}",
+    )
+    thermostat_time_ps: Positive | None = None
+    """Time constant of velocity_rescaling (default: 0.1 ps), period of nose_hoover (0.5 ps), or mean time between two
+    collisions of a molecule with andersen (1 ps)"""
+    friction_translation_per_ps: Positive | None = None
+    """Friction of langevin on translation; default: 1"""
+    friction_rotation_per_ps: Positive | None = None
+    """Friction of langevin on rotation; default: friction_translation_per_ps"""
+    nose_hoover_links: Annotated[int, Strict(), Field(ge=1, le=100)] = 3
+    """Links of each Nose-Hoover chain"""
+
+
+class BarostatKeys(Section):
+    """The keys of barostats in a stage."""
+
+    pressure_bar: Number | tuple[Number, Number] | tuple[Number, Number, Number] | Six | None = None
+    """Pressure of the barostat, or of the minimisation of the enthalpy; two for a linear change over the stage,
+    [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
+    pressure_coupling: Shapes = "isotropic"
+    """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z separately; anisotropic:
+    three edges; flexible: edges and angles"""
+    barostat: Annotated[str, NameIn(BAROSTATS)] | None = Field(
+        default=None,
+        description="; ".join(f"{name}, of {kind.ensembles[0]}: {kind.summary}" for name, kind in BAROSTATS.items())
+        + ". Default: the first one of the ensemble",
+    )
+    barostat_time_ps: Positive | None = None
+    """Time constant of cell_rescaling, period of the piston of nph; default: 1 ps"""
+    barostat_interval_ps: Positive | None = None
+    """Time between two moves of the box in npt; default: 0.05 of barostat_time_ps"""
+    compressibility_per_bar: Positive | None = None
+    """Compressibility; it sets the speed of the box, not the ensemble. Default: 4.5e-5, of water"""
