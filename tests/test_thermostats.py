@@ -1,11 +1,14 @@
 """Thermostats: exact distributions of free bodies, heat to the last digit, chains that conserve, the same bits."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from scipy import stats
 from support import (
     BATCH,
     HEAT,
+    ROOT,
     SCHEMES,
     THERMOSTAT,
     WITH_THERMOSTAT,
@@ -15,20 +18,27 @@ from support import (
     NoseHoover,
     Ramp,
     apply_langevin_group,
+    boxes,
     build,
     built,
     constant_ramp,
+    couplings,
+    describe_stage,
+    implements,
     integrator_of_stage,
     kernel,
     key_of,
     move,
     observe,
+    ramps,
     remove_overlaps,
     small_scene,
 )
 
+import rigidmd
 from rigidmd.errors import SceneError
 from rigidmd.run import Simulation
+from rigidmd.scene import schema
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 VERLET, BAOAB = SCHEMES["velocity_verlet"], WITH_THERMOSTAT["baoab"]
@@ -226,3 +236,100 @@ def test_degrees_of_freedom_follow_the_thermostat():
 def test_stages_that_cannot_be(stage, message):
     with pytest.raises(SceneError, match=message):
         small_scene({"argon": 20}, 30.0, stages=[{"duration_ps": 0.01} | stage])
+
+
+class Braking(NamedTuple):
+    """A made-up thermostat that slows all molecules down."""
+
+    time: float
+
+
+@rigidmd.compiled_thermostat(Braking)
+def brake(thermostat, model, state, h, draw):
+    factor = np.exp(-h / thermostat.time)
+    for m in range(len(state.velocity)):
+        for k in range(3):
+            before = state.velocity[m, k]
+            state.velocity[m, k] *= factor
+            state.energy_ledger[0] -= 0.5 * model.mass[model.species[m]] * (before**2 - state.velocity[m, k] ** 2)
+
+
+class Swelling(NamedTuple):
+    """A made-up barostat with trial moves, all of which are accepted."""
+
+    strain: float
+    tail: tuple
+    key: tuple
+
+
+@implements(boxes.propose_strain, Swelling)
+def propose_swelling(barostat, model, state, workspace, h, draw):
+    for k in range(3):
+        workspace.strain[0, k] = barostat.strain
+    boxes.set_matrices(workspace)
+
+
+@implements(boxes.rescale_velocities, Swelling)
+def keep_velocities(barostat, state, workspace):
+    return None
+
+
+@implements(boxes.log_acceptance, Swelling)
+def accept_swelling(barostat, model, state, workspace, h):
+    return 0.1
+
+
+def test_adding_a_thermostat_and_a_barostat(monkeypatch):
+    """A row in the table of scenes and a row in that of flows: all that knows their names follows."""
+    stage = {
+        "ensemble": "npt",
+        "temperature_K": 300.0,
+        "pressure_bar": 1.0,
+        "duration_ps": 0.02,
+        "barostat_interval_ps": 0.01,
+    }
+    stage |= {"thermostat": "braking", "barostat": "swelling"}
+    with pytest.raises(SceneError, match="'braking', must be 'velocity_rescaling', "):
+        small_scene({"argon": 20}, 40.0, stages=[stage])
+    made = couplings.Coupling("a brake", "nobody", {"thermostat_time_ps": 0.25}, on_molecules=True)
+    monkeypatch.setitem(couplings.THERMOSTATS, "braking", made)
+    made = couplings.Coupling("a balloon", "nobody", {"barostat_interval_ps": 0.01}, ("npt",), shapes=("isotropic",))
+    monkeypatch.setitem(couplings.BAROSTATS, "swelling", made)
+    monkeypatch.setitem(ramps.THERMOSTATS, "braking", lambda stage, *given: Braking(stage.thermostat_time))
+    monkeypatch.setitem(boxes.BAROSTATS, "swelling", lambda stage, given: Swelling(0.01, given.tail, given.key))
+    properties = schema()["$defs"]["Stage"]["properties"]
+    assert "braking" in properties["thermostat"]["enum"] and "swelling" in properties["barostat"]["enum"]
+    for wrong, message in (
+        ({"nose_hoover_links": 4, "barostat_time_ps": 1.0}, "nose_hoover_links, barostat_time_ps would do nothing with braking and swelling"),
+        ({"pressure_coupling": "flexible"}, "'swelling' allows only an isotropic pressure; cell_rescaling allows others"),
+        ({"ensemble": "nph", "temperature_K": None, "thermostat": None}, "'swelling' is for npt; nph has piston"),
+    ):  # fmt: skip
+        with pytest.raises(SceneError, match=message):
+            small_scene({"argon": 20}, 40.0, stages=[{k: v for k, v in (stage | wrong).items() if v is not None}])
+    scene = rigidmd.resolve(small_scene({"argon": 20}, 40.0, forces={"lennard_jones": False}, stages=[stage]))
+    assert (scene.stages[0].thermostat_time_ps, scene.stages[0].barostat_time_ps) == (0.25, None)
+    described = " ".join(describe_stage(scene.stages[0]))
+    assert "300 K by braking, 0.25 ps, 1 bar by swelling, isotropic, a move every 5 steps" in described
+    assert "not the total momentum" in described
+    results = Simulation(scene).run()
+    assert results["kinetic"][-1] == pytest.approx(results["kinetic"][0] * np.exp(-2 * 0.02 / 0.25), rel=1e-9)
+    assert results["volume"][-1] == pytest.approx(results["volume"][0] * np.exp(2 * 0.03), rel=1e-9)
+    assert results["conserved"][-1] == pytest.approx(results["conserved"][0], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "physics"),
+    [(couplings.THERMOSTATS, "dynamics/thermostats.py"), (couplings.BAROSTATS, "dynamics/barostats.py")],
+)
+def test_adding_a_thermostat_or_barostat_takes_two_files(kinds, physics):
+    """No other file has their names: but those of other engines, and langevin's where it is the default with baoab."""
+    allowed = {"scene/couplings.py", physics, "assemble/defaults.py"}
+    package = ROOT / "rigidmd"
+    for path in package.rglob("*.py"):
+        where = path.relative_to(package).as_posix()
+        if where not in allowed and not where.startswith("engines/"):
+            text = path.read_text(encoding="utf-8")
+            assert not [name for name in kinds if f'"{name}"' in text and name != "langevin"], where
+    documents = (package / "docs" / "ensembles.md").read_text(encoding="utf-8")
+    for name, kind in kinds.items():
+        assert f'`"{name}"`' in documents and kind.source.split(",")[0].split(" 20")[0].split(" 19")[0] in documents

@@ -45,21 +45,19 @@ def _displace_body(model, state, load, tau):
             state.position[k, i] += tau / model.translation.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
         n, time = load.torque_body[k], state.time[NOW]
-        rotate_by_vector(
-            state.rotation[k],
-            tau * moments(model.rotor, time, 0)[0] * n[0],
-            tau * moments(model.rotor, time, 1)[0] * n[1],
-            tau * moments(model.rotor, time, 2)[0] * n[2],
+        i0, i1, i2 = (
+            moments(model.rotor, time, 0)[0],
+            moments(model.rotor, time, 1)[0],
+            moments(model.rotor, time, 2)[0],
         )
+        rotate_by_vector(state.rotation[k], tau * i0 * n[0], tau * i1 * n[1], tau * i2 * n[2])
 
 
 @implements(add_gyration, Body, inline=True)
 def _add_gyration_of_body(model, load, tau, gain):
     for b in range(len(load.torque_body)):
         n = load.torque_body[b]
-        i0 = moments(model.rotor, 0.0, 0)[0]
-        i1 = moments(model.rotor, 0.0, 1)[0]
-        i2 = moments(model.rotor, 0.0, 2)[0]
+        i0, i1, i2 = moments(model.rotor, 0.0, 0)[0], moments(model.rotor, 0.0, 1)[0], moments(model.rotor, 0.0, 2)[0]
         gain.torque_body[b, 0] += tau * (i1 - i2) * n[1] * n[2]
         gain.torque_body[b, 1] += tau * (i2 - i0) * n[2] * n[0]
         gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
@@ -83,8 +81,7 @@ def _accumulate_work_of_body(model, terms, state, h):
 def relative_motion(model, state):
     """(velocity along lab axes, omega along body axes) relative to the frame, as tuples; 0 where the body has none."""
     W = frame_rate(model.frame, state.time[NOW])
-    velocity = (0.0, 0.0, 0.0)
-    omega = (0.0, 0.0, 0.0)
+    velocity = omega = (0.0, 0.0, 0.0)
     if len(state.position):
         V = state.velocity[0]
         velocity = (V[0], V[1], V[2])
