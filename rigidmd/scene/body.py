@@ -33,9 +33,9 @@ from rigidmd.scene.body_forces import (
     PositiveVector,
     Wheel,
 )
-from rigidmd.scene.integrators import IntegratorKey, MovedByScheme
+from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.limits import BodyWatch
-from rigidmd.scene.validation import MOST_TABLES, Flag, Number, Positive, Section, Vector, location_of
+from rigidmd.scene.validation import MOST_TABLES, Flag, NameIn, Number, Positive, Section, Vector, location_of
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -249,7 +249,7 @@ class Run(MovedByScheme):
     timestep_s: Positive
     """Time step; with dop853 and radau, whose steps are adaptive, the interval between observations; with auto the
     longest step"""
-    integrator: Annotated[str, IntegratorKey((*SCHEMES, AUTO, *SOLVERS))] = "velocity_verlet"
+    integrator: Annotated[str, NameIn((*SCHEMES, AUTO, *SOLVERS), in_scene=True)] = "velocity_verlet"
     """A scheme of flows; auto: the scheme and step that keep the requested error with the fewest force evaluations; or
     a general ODE solver for the textbook equations: rk4, dop853, radau"""
     energy_error: Positive | None = None

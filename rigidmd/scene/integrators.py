@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, PrivateAttr, Strict, ValidationError, ValidationInfo
+from pydantic import Field, PrivateAttr, Strict, ValidationError
 
 from rigidmd.core.integrators import (
     AUTO,
@@ -18,7 +18,7 @@ from rigidmd.core.integrators import (
 )
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import SceneError
-from rigidmd.scene.validation import Line, NameIn, Section, validation_messages
+from rigidmd.scene.validation import Line, Section, validation_messages
 
 RESERVED = (*SCHEMES, *WITH_THERMOSTAT, AUTO, *SOLVERS)
 Coefficient = Annotated[float, Strict(), Field(ge=-10, le=10)]
@@ -106,13 +106,6 @@ def with_registered_rows(data: dict[str, Any]) -> dict[str, Any]:
     taken = [table.get("name") for table in there if isinstance(table, dict)]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
     return data | {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else data
-
-
-class IntegratorKey(NameIn):
-    """Annotation of the name of an integrator: one of these names, or of a row in [[integrators]]."""
-
-    def known(self, info: ValidationInfo):
-        return (*self.names, *(info.context or ()))
 
 
 class MovedByScheme(Section):

@@ -16,8 +16,8 @@ from rigidmd.scene.couplings import (
     ThermostatKeys,
     Values,
 )  # fmt: skip
-from rigidmd.scene.integrators import IntegratorKey, MovedByScheme
-from rigidmd.scene.validation import Count, Line, Positive, Section
+from rigidmd.scene.integrators import MovedByScheme
+from rigidmd.scene.validation import Count, Line, NameIn, Positive, Section
 
 MOST_STEPS = 1e12
 
@@ -79,7 +79,7 @@ class Timing(Section):
 class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     """A part of a run with one ensemble and one time step."""
 
-    integrator: Annotated[str, IntegratorKey((*SCHEMES, *WITH_THERMOSTAT, AUTO))] = "velocity_verlet"
+    integrator: Annotated[str, NameIn((*SCHEMES, *WITH_THERMOSTAT, AUTO), in_scene=True)] = "velocity_verlet"
     """Scheme of kicks and drifts; baoab: the thermostat acts in the middle of the drift, langevin by default; auto: the
     scheme and step that keep the requested error with the fewest force evaluations"""
     energy_error_kT: Positive | None = None

@@ -52,19 +52,16 @@ Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max
 
 class NameIn:
     """Annotation of a text that is a name in a table, which is read anew at each validation. Its JSON schema lists the
-    names."""
+    names. in_scene : whether names in the context of the validation are known too"""
 
-    def __init__(self, names: Collection[str]):
-        self.names = names
-
-    def known(self, info: ValidationInfo) -> Collection[str]:
-        return self.names
+    def __init__(self, names: Collection[str], in_scene: bool = False):
+        self.names, self.in_scene = names, in_scene
 
     def _check(self, name: Any, info: ValidationInfo) -> str:
-        known = self.known(info)
-        if not isinstance(name, str) or name not in known:
-            *first, last = [repr(other) for other in known]
-            raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}"})
+        *first, last = known = [*self.names, *(info.context or () if self.in_scene else ())]
+        if name not in known:
+            expected = f"{', '.join(map(repr, first))} or {last!r}"
+            raise PydanticKnownError("literal_error", {"expected": expected})
         return name
 
     def __get_pydantic_core_schema__(self, source, handler):
