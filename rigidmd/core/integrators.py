@@ -173,8 +173,8 @@ def even(*half: float) -> tuple[float, ...]:
 
 
 def measured_order(scheme: Scheme) -> float:
-    """Order of the error for the force -x - x^3, from one step and two of half the length, at the shortest steps at which
-    rounding does not dominate. It may exceed the order for other forces."""
+    """Order of the error for the force -x - x^3, from one step and two of half the length. Steps are the shortest at
+    which rounding does not dominate. The order may be lower for other forces."""
     lengths = [0.4 / 2**k for k in range(7)]
     errors = [abs(_oscillate(scheme, h, 1) - _oscillate(scheme, h / 2, 2)) for h in lengths]
     errors = list(takewhile(lambda error: error > 3e-14, errors))
