@@ -105,17 +105,16 @@ def _rigid_frames(
     if start is None:
         of_stage = shown & (columns["time"] >= first) & (columns["time"] <= last)
         begin = production_start(columns, of_stage, stage.changes_box)
-        notes = [*notes, f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps"]
+        notes.append(f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps")
     else:
         begin = start
         if begin < first:
-            notes = [*notes, f"frames before {first:g} ps are of an earlier stage"]
+            notes.append(f"frames before {first:g} ps are of an earlier stage")
     if not stage.keeps_momentum:
-        notes = [
-            *notes,
+        notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and rotation, and "
-            "changes spectra and viscosity; use nve or velocity_rescaling for these",
-        ]
+            "changes spectra and viscosity; use nve or velocity_rescaling for these"
+        )
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((stored.time >= begin - slack) & (stored.time <= last + slack))
     times = _without_rounding(stored.time[keep])

@@ -282,11 +282,6 @@ class Run(MovedByScheme):
             yield f"duration_s = {self.duration_s:g} is less than one step of {self.timestep_s:g} s"
 
     @property
-    def is_auto(self) -> bool:
-        """Whether integrator and step are still to be chosen."""
-        return self.integrator == AUTO
-
-    @property
     def steps(self) -> int:
         return round(self.duration_s / self.timestep_s)
 

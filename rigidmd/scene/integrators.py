@@ -102,7 +102,7 @@ def with_registered_rows(data: dict[str, Any]) -> dict[str, Any]:
     there, stages = data.get("integrators", []), data.get("stages", [])
     if not (_REGISTERED and isinstance(there, list) and isinstance(stages, list)):
         return data
-    names = dict.fromkeys(table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict))
+    names = [table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)]
     taken = [table.get("name") for table in there if isinstance(table, dict)]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
     return data | {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else data
@@ -129,6 +129,11 @@ class MovedByScheme(Section):
     def scheme(self) -> Scheme:
         """The integrator with its rotor."""
         return self.row.with_rotor(self.rotor)
+
+    @property
+    def is_auto(self) -> bool:
+        """Whether integrator and step are still to be chosen."""
+        return self.integrator == AUTO
 
     @property
     def has_scheme(self) -> bool:

@@ -215,11 +215,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         return self.ensemble == "minimise"
 
     @property
-    def is_auto(self) -> bool:
-        """Whether integrator and step are still to be chosen."""
-        return self.integrator == AUTO
-
-    @property
     def thermostat_is_open(self) -> bool:
         """Whether the thermostat is chosen with the integrator: bias_kT is given, and no key of a thermostat."""
         return self.bias_kT is not None and self.thermostat is None and self.thermostat_time_ps is None
