@@ -176,6 +176,7 @@ class Settings(TypedDict, total=False):
     forces: dict[str, Any]
     fields: dict[str, Any]
     start: dict[str, Any]
+    integrators: list[dict[str, Any]]
     stages: list[dict[str, Any]]
     run: dict[str, Any]
     output: dict[str, Any]
