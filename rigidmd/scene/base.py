@@ -188,7 +188,8 @@ class Scene(Section, Displayed):
             return SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in found])
 
         try:
-            scene = kind.model_validate(with_registered_rows(data), context={})
+            whole, rows = with_registered_rows(data)
+            scene = kind.model_validate(whole, context=rows)
         except ValidationError as error:
             raise refusal(faults + validation_messages(error, kind, text, overridden)) from None
         if faults:

@@ -97,15 +97,15 @@ def integrator(
     return name
 
 
-def with_registered_rows(data: dict[str, Any]) -> dict[str, Any]:
-    """Tables of a scene with those registered rows that it names and does not have."""
-    there, stages = data.get("integrators", []), data.get("stages", [])
-    if not (_REGISTERED and isinstance(there, list) and isinstance(stages, list)):
-        return data
+def with_registered_rows(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Scheme]]:
+    """Tables of a scene with those registered rows that it names and does not have; and its names of rows, each with a
+    scheme that stands for an invalid row, so that only the row is an error."""
+    there, stages = ([*given] if isinstance(given := data.get(key), list) else [] for key in ("integrators", "stages"))
     names = [table.get("integrator") for table in (*stages, data.get("run")) if isinstance(table, dict)]
-    taken = [table.get("name") for table in there if isinstance(table, dict)]
+    taken = [name for table in there if isinstance(table, dict) and isinstance(name := table.get("name"), str)]
     rows = [row for name, row in _REGISTERED.items() if name in names and name not in taken]
-    return data | {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else data
+    changed = {"integrators": [*there, *(row.model_dump(exclude_none=True) for row in rows)]} if rows else {}
+    return data | changed, dict.fromkeys(taken, SCHEMES["velocity_verlet"])
 
 
 class MovedByScheme(Section):
