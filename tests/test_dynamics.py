@@ -436,7 +436,7 @@ name = "other"
 order = 2
 steps = [0.5, 0.5]
 [box]
-lengths_A = 30.0
+lengths_A = 20.0
 [[molecules]]
 model = "argon"
 count = 20
@@ -460,7 +460,7 @@ def test_adding_an_integrator_to_a_scene(tmp_path, capsys):
         assert main(["run", str(tmp_path / f"{name}.toml"), "-o", str(tmp_path / name)]) == 0
     logs = [(tmp_path / name / "log.csv").read_text() for name in ("mine", "srkn_4")]
     assert logs[0] == logs[1]
-    assert main(["resume", str(tmp_path / "mine"), "--until", "0.08"]) == 0  # the folder has the row
+    assert main(["resume", str(tmp_path / "mine"), "--until", "0.08ps"]) == 0  # the folder has the row
     assert "mine" in capsys.readouterr().out
     found = measure_accuracy(
         Scene.read(tmp_path / "mine" / "scene.toml"), ["mine", "srkn_4", "other"], [8.0], repeats=1

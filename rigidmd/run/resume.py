@@ -9,6 +9,7 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
 from rigidmd.errors import CheckpointError
@@ -93,14 +94,16 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
     return Checkpoint({name: found.get(name) for name in plain_types}, arrays)
 
 
-def restored(kept: Checkpoint, types: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes that `stored` has written, validated. Raises ValueError or KeyError."""
+def restored(kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None) -> dict[str, Any]:
+    """The attributes that `stored` has written, validated. rows : custom integrators, see `Scene.rows`. Raises
+    ValueError or KeyError."""
     arrays: dict[str, Any] = {name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray}
     for name in (name for name, kind in types.items() if kind == Arrays):
         start = f"{name}/"
         arrays[name] = {key.removeprefix(start): kept.arrays[key] for key in kept.arrays if key.startswith(start)}
     try:
-        found = _model_of({name: types[name] for name in types if name not in arrays}).model_validate(kept.values)
+        model = _model_of({name: types[name] for name in types if name not in arrays})
+        found = model.model_validate(kept.values, context=rows)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

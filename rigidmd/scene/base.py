@@ -72,9 +72,14 @@ class Scene(Section, Displayed):
         return rows
 
     @property
+    def rows(self) -> dict[str, Scheme]:
+        """The integrators of [[integrators]]."""
+        return {row.name: row.scheme for row in self.integrators}
+
+    @property
     def schemes(self) -> dict[str, Scheme]:
         """The integrators without a thermostat: those of rigidmd and of [[integrators]]."""
-        return SCHEMES | {row.name: row.scheme for row in self.integrators}
+        return SCHEMES | self.rows
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.in_short}>"
