@@ -142,9 +142,8 @@ class RunLoop:
             scene, changed = plain(simulation.scene), None
             if kept is not None:
                 with as_checkpoint_errors(self._folder):
-                    part.record = part.record_type(
-                        **restored(kept.of(RECORD), part.record_type.types(), part.scene.rows)
-                    )
+                    kind = part.record_type
+                    part.record = kind(**restored(kept.of(RECORD), kind.types(), part.scene.rows))
                     part.restore(kept)
                     part.check_position()
                     changed = describe_changes(kept.values["with"])
