@@ -40,7 +40,7 @@ _HOMES = {
     "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
     "integrator": "scene.integrators",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
-    "LivePlot": "view.live", "sweep": "studies.sweep.sweeping", "analysis": "", "view": "",
+    "LivePlot": "view.plots", "sweep": "studies.sweep.sweeping", "analysis": "", "view": "",
 }  # fmt: skip
 __all__ = [
     "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
