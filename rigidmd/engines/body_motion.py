@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.state import WORK, State
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column
+from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column, SampleTable
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce, steady_energies
 from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
@@ -22,8 +22,8 @@ class Snapshot(NamedTuple):
     state: State
 
 
-@dataclass
-class Motion:
+@dataclass(repr=False)
+class Motion(SampleTable):
     """The samples of a run as columns.
 
     columns : name -> array (t,) in SI units; `described` explains them. Position, velocity, attitude and omega are
@@ -36,31 +36,16 @@ class Motion:
     columns: dict[str, np.ndarray]
     invariants: list[str]
 
-    def __len__(self) -> int:
-        return len(self.columns.get("time", ()))
+    def __post_init__(self) -> None:
+        self.described = {name: BODY_COLUMNS[name] for name in self.columns}
+        if BODY["rotation"].names[0] in self.columns:
+            self.described[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")
 
-    def __repr__(self) -> str:
-        return f"<Motion: {len(self)} samples of {', '.join(self.columns)}>"
-
-    def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array (t,) in SI units. "Q", for a body that rotates, gives matrices (t, 3, 3)."""
-        if column not in self.described:
-            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
-        if column == MATRIX:
+    def _array(self, name: str) -> np.ndarray:
+        """An array (t,) in SI units; of "Q", for a body that rotates, matrices (t, 3, 3)."""
+        if name == MATRIX:
             return np.stack([self.columns[name] for name in BODY["rotation"].names], axis=-1).reshape(-1, 3, 3)
-        return self.columns[column]
-
-    @property
-    def written(self) -> dict[str, np.ndarray]:
-        """The columns by their headers in motion.csv."""
-        return {BODY_COLUMNS[name].header: values for name, values in self.columns.items()}
-
-    @property
-    def described(self) -> dict[str, Column]:
-        found = {name: BODY_COLUMNS[name] for name in self.columns}
-        if BODY["rotation"].names[0] in found:
-            found[MATRIX] = Column("", "1", "the rotation matrices (n, 3, 3): lab = Q body")
-        return found
+        return self.columns[name]
 
 
 def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:

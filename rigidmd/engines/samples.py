@@ -109,7 +109,33 @@ MATRIX = "Q"
 BODY_COLUMNS = {n: Column("t" if n == "time" else n, f.unit, f.about) for f in BODY.values() for n in f.names}
 
 
-class Samples:
+class SampleTable:
+    """The samples of a run as arrays by the names of their columns, which `described` has."""
+
+    described: dict[str, Column]
+
+    def __len__(self) -> int:
+        return len(self["time"])
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {len(self)} samples of {', '.join(self.described)}>"
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """A column as an array, one value for each sample, in its unit in the file. Raises KeyError with all names."""
+        if column not in self.described:
+            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
+        return self._array(column)
+
+    def _array(self, name: str) -> np.ndarray:
+        raise NotImplementedError
+
+    @property
+    def written(self) -> dict[str, np.ndarray]:
+        """The columns by their headers in the file."""
+        return {column.header: self[name] for name, column in self.described.items() if column.header}
+
+
+class Samples(SampleTable):
     """The samples of a run in order: a table with one row of float64 per sample.
 
     stages : names of all stages
@@ -119,6 +145,7 @@ class Samples:
 
     def __init__(self, stages: Sequence[str], user_terms: tuple[str, ...] = (), table: np.ndarray | None = None):
         self.stages, self.user_terms = tuple(stages), user_terms
+        self.described = COLUMNS | user_columns(user_terms)
         self._numbers = [*NUMBERS, *user_terms]
         self._values = array("d")  # grows in place
         if table is not None:
@@ -131,22 +158,16 @@ class Samples:
             if not ((np.abs(step) < 2**53) & (np.floor(step) == step)).all():
                 raise ValueError("samples have steps that are not whole numbers")
 
-    def __repr__(self) -> str:
-        return f"<Samples: {len(self)} of {', '.join(self.described)}>"
-
     def append(self, sample: Sample) -> None:
         self._values.extend((*_VALUES(sample), *sample.user_energies))
 
     def __len__(self) -> int:
         return len(self._values) // len(self._numbers)
 
-    def __getitem__(self, column: str) -> np.ndarray:
-        """A column as an array (rows,), by the name of a field of `Sample`, in the unit of the log."""
-        if column not in self.described:
-            raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
-        if column == "stage_name":
+    def _array(self, name: str) -> np.ndarray:
+        if name == "stage_name":
             return np.array(self.stages)[self["stage"]]
-        return self._column(column).astype(int if column in ("step", "stage") else float)  # a copy
+        return self._column(name).astype(int if name in ("step", "stage") else float)  # a copy
 
     def __iter__(self) -> Iterator[Sample]:
         return map(self.row, range(len(self)))
@@ -184,10 +205,6 @@ class Samples:
     def _column(self, name: str) -> np.ndarray:
         """A view of a column. It must be released before the next sample is appended."""
         return np.asarray(self._values)[self._numbers.index(name) :: len(self._numbers)]
-
-    @property
-    def described(self) -> dict[str, Column]:
-        return COLUMNS | user_columns(self.user_terms)
 
 
 _VALUES = attrgetter(*NUMBERS)

@@ -86,12 +86,7 @@ class Results(Displayed):
         from rigidmd.io.log import TENSOR
 
         left_out = () if getattr(self.system.scene.output, "pressure_tensor", True) else TENSOR
-        written = {
-            name: column.header
-            for name, column in self.samples.described.items()
-            if column.header and name not in left_out
-        }
-        return pandas.DataFrame({header: self[name] for name, header in written.items()})
+        return pandas.DataFrame(self.samples.written).drop(columns=[self.samples.described[n].header for n in left_out])
 
     def universe(self) -> "MDAnalysis.Universe":
         """The trajectory as an MDAnalysis Universe, from the files if there are any, or else from memory.
