@@ -1,27 +1,27 @@
 """The system of a scene of molecules: species, model, start, terms. All errors are collected and raised together."""
 
 from dataclasses import replace
-from math import inf
 
 import numpy as np
 
-from rigidmd.assemble.defaults import Composition, with_defaults, with_engine_defaults, with_momentum_removal
-from rigidmd.assemble.fields import SystemParts, field_notes, field_terms, fields_left_out, wrapped_between_walls
+from rigidmd.assemble.defaults import with_defaults, with_engine_defaults, with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import residue_numbers, set_momenta, starting_configuration
-from rigidmd.assemble.terms import interactions, left_out
+from rigidmd.assemble.terms import field_terms, interactions, left_out, wrapped_between_walls
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.forces.neighbors.space import space_of
-from rigidmd.forces.potentials.lennard_jones import sum_of_tails
+from rigidmd.forces.neighbors.space import cell_of, space_of
+from rigidmd.forces.parts import Composition, SystemParts, sum_of_tails
+from rigidmd.io.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.fields import field_notes
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import missing_user_code
 
@@ -37,7 +37,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     space, number = space_of(start.cell), residue_numbers(start)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
-    resolved = with_defaults(scene, Composition(species, counts, space, start.basis))
+    cell = "" if start.cell is None else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
+    resolved = with_defaults(scene, Composition(species, counts, space, start.basis, cell))
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
@@ -47,16 +48,16 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
         cell=start.cell,
     )
-    acting = interactions(scene, species, model, space, state, start.basis, resolved.pme_grid)
-    parts = SystemParts(species, model, space, scene.forces.cutoff_A or inf, state, number)
-    acting.terms.update(field_terms(scene, parts))
+    parts = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
+    acting = interactions(parts)
+    acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
     system = System(
         scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
         freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,
         tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
-        left_out=[*left_out(scene, acting.terms, model, space), *fields_left_out(acting.terms)],
+        left_out=left_out(scene, acting.terms, model, space),
         force_error=acting.force_error,
         notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )  # fmt: skip

@@ -7,9 +7,9 @@ import numpy as np
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
-from rigidmd.assemble.fields import describe_fields
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
+from rigidmd.assemble.terms import describe_fields
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
@@ -103,7 +103,7 @@ def _describe_molecules(system: System) -> str:
     lines.append("\ncompiled in:")
     descriptions = describe_fields(scene, system.terms) | system.user_terms
     for name, term in system.terms.items():
-        lines.append(f"  {name.replace('_', ' ')}: {descriptions.get(name) or _describe_term(system, name, term)}")
+        lines.append(f"  {name.replace('_', ' ')}: {descriptions.get(name) or _describe_term(system, term)}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if system.thermostat is not None:
@@ -132,10 +132,10 @@ def _describe_molecules(system: System) -> str:
     return "\n".join(lines)
 
 
-def _describe_term(system: System, name: str, term: NamedTuple) -> str:
+def _describe_term(system: System, term: NamedTuple) -> str:
     if not isinstance(term, PairForces):
         return type(term).__name__
     reach = f"cutoff {system.cutoff:g} Å" if system.cutoff < inf else "no cutoff"
-    if system.cutoff < inf and (name == "lennard_jones" or system.scene.forces.electrostatics == "reaction_field"):
+    if system.cutoff < inf and hasattr(term.potential, "truncation"):
         reach += f", {system.scene.forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"

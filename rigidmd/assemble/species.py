@@ -1,11 +1,11 @@
 """The species of a scene: their rigid molecules, and which molecules are frozen."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from rigidmd.errors import InputError, SceneError, StructureError
+from rigidmd.forces.parts import select_by_number
 from rigidmd.io.structure_file import read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
@@ -77,22 +77,6 @@ def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ..
     if faults:
         raise StructureError(str(path), list(dict.fromkeys(faults)))
     return with_parameters(tuple(sites), table)
-
-
-def select_by_number(
-    ranges: list[tuple[int, int]], name: str, of_species: np.ndarray, number: np.ndarray
-) -> Iterator[tuple[str, np.ndarray, str]]:
-    """For each range of molecule numbers of a species: its text, its mask (n,), and a message on missing numbers."""
-    for first, last in ranges:
-        text, mask = (
-            f"{first}" if first == last else f"{first}-{last}",
-            of_species & (first <= number) & (number <= last),
-        )
-        fault, present = "", number[of_species]
-        if not mask.any() or last > present.max():
-            there = f"they have {present.min()} to {present.max()}" if len(present) else "there are none"
-            fault = f"no {name} has the number {text}; {there}"
-        yield text, mask, fault
 
 
 def split_frozen(

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.assemble.fields import range_of_centres
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.assemble.structure import Configuration, read_structure, with_reduced_cell
 from rigidmd.core.state import State
@@ -13,6 +12,7 @@ from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.io.cells import cell_error
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene

@@ -16,13 +16,13 @@ from rigidmd.compile.code import (
     pack_arguments,
     task,
 )
-from rigidmd.compile.kernels import implements, is_a, kernel
+from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.layout import NumbaStruct
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.thread_pool import call_address, set_threads
 
 __all__ = [
     "BLOCKS", "MOST_BLOCKS", "SIMD_BITS", "BoundTask", "Code", "CompiledTask", "NumbaStruct", "TaskArguments", "call",
-    "call_address", "call_blocks", "compile_together", "implements", "is_a", "kernel", "load_arguments",
+    "call_address", "call_blocks", "chosen_by_type", "compile_together", "implements", "is_a", "kernel", "load_arguments",
     "pack_arguments", "set_threads", "task",
 ]  # fmt: skip

@@ -1,5 +1,6 @@
 """Kernels: functions compiled by Numba, with the compiler options that rigidmd needs."""
 
+import functools
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -60,6 +61,20 @@ def implements(
         return function
 
     return register_for_kinds
+
+
+def chosen_by_type(choose: Callable | None = None, *, inline: bool = False, count_references: bool = True) -> Any:
+    """A function for compiled code. The decorated function is called with the Numba types of the arguments, and returns
+    the implementation for them; options as for `kernel`. `implements` can add implementations where it returns None."""
+    if choose is None:
+        return lambda f: chosen_by_type(f, inline=inline, count_references=count_references)
+
+    @functools.wraps(choose)
+    def stub(*arguments):
+        raise TypeError(f"{choose.__name__} is for compiled code only")
+
+    implements(stub, inline=inline, count_references=count_references)(choose)
+    return stub
 
 
 def compile_user_function(function: Callable, inline: bool = False) -> Callable:

@@ -12,10 +12,10 @@ import numpy as np
 
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.scene.models import gather_per_molecule
 from rigidmd.scene.stage import Stage
 
 #: Terms that the view includes. All others are fields and user-defined forces.

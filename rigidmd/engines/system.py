@@ -13,11 +13,10 @@ from rigidmd.core.state_file import SavedState
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import DegreesOfFreedom, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
-from rigidmd.forces.ewald.errors import Charges, charges_of
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
-from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.forces.parts import Tail, gather_per_molecule
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.models import Molecule, gather_per_molecule
+from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
 
 
@@ -197,11 +196,3 @@ def _lab_offsets(state: State, molecule: np.ndarray, offset_body: np.ndarray) ->
 def _gather(values: np.ndarray, molecule: np.ndarray) -> np.ndarray:
     """`values` gathered per molecule. `take` is 4 times faster than indexing."""
     return values.take(molecule, axis=0)
-
-
-def charges_in(species: list[Molecule], counts: np.ndarray) -> Charges:
-    """The charges of `counts` molecules of each species, in the form that error estimates need."""
-    charged = [(m, m.charges != 0) for m in species]
-    return charges_of(
-        [(int(n), m.charges[some], m.positions_body[some]) for n, (m, some) in zip(counts, charged, strict=True)]
-    )

@@ -79,25 +79,17 @@ def _worse_status(status, other):
     return lambda status, other: max(status, other)
 
 
+@chosen_by_type
 def power(term, state, velocity, omega):
     """Power of a term whose class has `time_dependent = True`; 0 for any other, since its energy includes its work.
     velocity (lab axes) and omega (body axes) : tuples, relative to the frame"""
-    raise TypeError("compiled code only")
-
-
-@implements(power)
-def _no_power(term, state, velocity, omega):
     if not getattr(term.instance_class, "time_dependent", False):
         return lambda term, state, velocity, omega: 0.0
 
 
+@chosen_by_type
 def energy_rate(term, state):
     """dU/dt at fixed positions of a term of molecules whose class has `time_dependent = True`; 0 for any other."""
-    raise TypeError("compiled code only")
-
-
-@implements(energy_rate)
-def _no_energy_rate(term, state):
     if not getattr(term.instance_class, "time_dependent", False):
         return lambda term, state: 0.0
 

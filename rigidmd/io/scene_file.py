@@ -16,7 +16,7 @@ from rigidmd.scene.molecules import STRUCTURE_NAME
 def input_names(scene: Scene) -> dict[str, str]:
     """Names of the copies of a scene's input files: dotted key -> unique name. Copies of copies keep their names."""
     names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE_NAME)
-    starts = {key: f"input_{re.sub(r'[.](file|module)$|^molecules[.]', '', key)}_" for key in names}
+    starts = {key: f"input_{re.sub(r'[.](file|module|table)$|^molecules[.]', '', key)}_" for key in names}
     return {key: starts[key] + name.removeprefix(starts[key]) for key, name in names.items()}
 
 

@@ -5,8 +5,8 @@ from typing import cast
 
 import numpy as np
 
-from rigidmd.assemble.electrostatics import NEUTRAL
 from rigidmd.engines.system import System
+from rigidmd.forces.ewald.interactions import NEUTRAL
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.truncation import Unmodified

@@ -1,10 +1,12 @@
 """The table [fields] of a scene of molecules: electric field, gravity, walls, restraints."""
 
+from collections.abc import Callable
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, Strict, field_validator
 
+from rigidmd.scene.forces import ELECTROSTATICS
 from rigidmd.scene.species import ResidueNumber, checked_numbers, spans
 from rigidmd.scene.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
 
@@ -124,10 +126,79 @@ class Fields(Section):
         if self.electric_phase_deg and self.electric_frequency_per_ps is None:
             yield "electric_phase_deg would do nothing without electric_frequency_per_ps"
 
+    @property
+    def entries(self) -> dict[str, tuple["FieldKind", Section, str]]:
+        """Name of each term -> its kind, the table with its keys, and the path of that table or key in the scene."""
+        found: dict[str, tuple[FieldKind, Section, str]] = {}
+        for name, kind in FIELDS.items():
+            value = getattr(self, kind.key)
+            if isinstance(value, tuple) and all(isinstance(entry, Section) for entry in value):
+                found |= {f"{name}_{k}": (kind, entry, f"fields.{kind.key}.{k}") for k, entry in enumerate(value)}
+            elif value is not None:
+                found[name] = (kind, value if isinstance(value, Section) else self, f"fields.{kind.key}")
+        return found
+
     def bounds(self, axis: int) -> tuple[float, float] | None:
         """Range of positions between the walls perpendicular to an axis, Å; None without walls."""
         ranges = [walls.positions_A for walls in self.walls if walls.direction == axis]
         return (max(lower for lower, _ in ranges), min(upper for _, upper in ranges)) if ranges else None
+
+
+class FieldKind(NamedTuple):
+    """A kind of field. Its keys are of `Fields`."""
+
+    module: str  # in `forces.fields`, with the function `term`
+    key: str  # of `Fields`: a value, a table or a list of tables, each of which is one term
+    title: str  # in the list of what a scene leaves out
+    sentence: Callable[[Any, Any], str]  # of the table with its keys and of its term, for `rigidmd check`
+
+
+def _electric_sentence(fields: Fields, term: Any) -> str:
+    if fields.electric_frequency_per_ps is None:
+        return f"{_vector(fields.electric_V_per_nm)} V/nm"
+    frequency = f"f = {fields.electric_frequency_per_ps:g}/ps; its work is in the energy ledger"
+    return f"{_vector(fields.electric_V_per_nm)} V/nm cos(2 pi f t + {fields.electric_phase_deg:g}°), {frequency}"
+
+
+def _walls_sentence(walls: Walls, term: Any) -> str:
+    kind = f"harmonic, {walls.stiffness_kJ_mol_A2 or 0:g} kJ/mol/Å²"
+    if walls.kind == "lj93":
+        kind = f"Lennard-Jones 9-3, sigma {walls.sigma_A:g} Å, epsilon {walls.epsilon_kJ_mol:g} kJ/mol, "
+        kind += f"cutoff {walls.cutoff_A:g} Å" if walls.cutoff_A else "no cutoff"
+    what = "centres of mass" if walls.acts_on == "centres" else f"{len(term.sites.molecule)} sites"
+    positions = [f"{walls.axis} = {x:g} Å" for x in walls.positions_A if abs(x) < inf]
+    return f"at {' and '.join(positions)}, on {what}: {kind}"
+
+
+def _restraint_sentence(entry: Restraint, term: Any) -> str:
+    size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
+    where = "to their starting positions" if entry.position_A is None else f"to {_vector(entry.position_A)} Å"
+    return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
+
+
+def _vector(values: Any) -> str:
+    return f"({', '.join(f'{x:g}' for x in values)})"
+
+
+#: Name of a term, to which a number is added if `key` is a list -> its kind.
+FIELDS = {
+    "electric_field": FieldKind("electric", "electric_V_per_nm", "electric field", _electric_sentence),
+    "gravity": FieldKind(
+        "gravity", "gravity_m_s2", "gravity", lambda fields, _: f"{_vector(fields.gravity_m_s2)} m/s²"
+    ),
+    "walls": FieldKind("walls", "walls", "walls", _walls_sentence),
+    "restraints": FieldKind("restraints", "restraints", "restraints", _restraint_sentence),
+}
+
+
+def field_notes(scene: "MolecularScene") -> list[str]:
+    method = scene.forces.electrostatics
+    if not scene.fields.walls or not ELECTROSTATICS[method].sums_images:
+        return []
+    return [
+        f"fields.walls: {method} includes the periodic images beyond the walls, which act on the layer between the "
+        "walls across the empty part of the box; a longer box reduces this effect"
+    ]
 
 
 def field_errors(scene: "MolecularScene") -> list[str]:

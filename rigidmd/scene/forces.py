@@ -1,7 +1,7 @@
 """The table [forces] of a scene of molecules: forces between sites."""
 
 from math import inf
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, Strict, model_validator
 
@@ -14,34 +14,29 @@ KIndex = Annotated[int, Strict(), Field(ge=0, le=1000)]
 Truncation = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 GridSize = Annotated[int, Strict(), Field(ge=8, le=4096)]
 
-EWALD_METHODS = ("ewald", "pme")
-#: Keys of `Forces` -> the methods of electrostatics that use them.
-ELECTROSTATIC_KEYS = {
-    "reaction_field_permittivity": ("reaction_field",),
-    "damping_per_A": ("damped_shifted_force",),
-    **dict.fromkeys(("ewald_accuracy", "ewald_alpha_per_A", "ewald_surface_permittivity"), EWALD_METHODS),
-    "ewald_truncation": EWALD_METHODS,
-    **dict.fromkeys(("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A"), ("ewald",)),
-    **dict.fromkeys(("pme_order", "pme_grid"), ("pme",)),
+
+class Method(NamedTuple):
+    """A method of electrostatics."""
+
+    module: str = ""  # in `forces`: its function `interactions`, and `setting_errors` and `settings` if it needs them
+    keys: tuple[str, ...] = ()  # of `Forces`, which do nothing with other methods
+    sums_images: bool = False  # whether charges act on all periodic images
+    conserves_momentum: bool = True
+
+
+_EWALD = ("ewald_accuracy", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_truncation")
+_K_VECTORS = ("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")
+#: Value of `electrostatics` -> the method.
+ELECTROSTATICS = {
+    "reaction_field": Method("potentials.coulomb", ("reaction_field_permittivity",)),
+    "ewald": Method("ewald.interactions", (*_EWALD, *_K_VECTORS), sums_images=True),
+    "pme": Method("ewald.interactions", (*_EWALD, "pme_order", "pme_grid"), True, conserves_momentum=False),
+    "damped_shifted_force": Method("potentials.screened_coulomb", ("damping_per_A",)),
+    "none": Method(),
 }
-
-
-#: A cutoff this close to the minimum of an energy, as a fraction, is the rounded minimum of a repulsive potential.
-MINIMUM_TOLERANCE = 0.01
-
-
-def short_cutoff_note(cutoff: float, sites: str, minimum: float) -> str:
-    """A note on a cutoff (Å) below the minimum of the energy of two sites."""
-    unit = "Is it in nm? " if cutoff < 2 < minimum else ""
-    return (
-        f"a cutoff of {cutoff:g} Å is shorter than {minimum:.3g} Å, where the energy of {sites} has its minimum: they "
-        f"only repel each other, and no liquid holds together. {unit}A usual cutoff is {2.2 * minimum:.2g} Å or more"
-    )
-
-
-def default_switch_start(truncation: str, cutoff: float) -> float:
-    """The default of switch_start_A, Å."""
-    return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)
+#: Pair potentials that are not of charges: key of `Forces`, which also names the term and the module in
+#: `forces.potentials` with the function `interactions` -> its name in the list of what a scene leaves out, and why.
+POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
 class UnlikePair(Section):
@@ -60,12 +55,16 @@ class PairParameters(Section):
 
     sites: tuple[str, str]
     """The two kinds, by site, SPECIES.SITE or element"""
-    parameters: dict[str, Number] = Field(max_length=MOST_TABLES)
-    """Parameters by name"""
+    parameters: dict[str, Number] = Field(default={}, max_length=MOST_TABLES)
+    """Parameters by name; a table needs none"""
+
+
+#: Keys of a custom force that name a file.
+FORCE_FILES = ("module", "table")
 
 
 class CustomForce(Section):
-    """A custom force: a formula of the distance between sites, or an object in a Python file."""
+    """A custom force: a formula of the distance between sites, a table, or an object in a Python file."""
 
     name: Annotated[str, Field(pattern=r"^[^\W\d]\w*$", max_length=40)]
     """Name in the log; with `module` also the name of the object in it"""
@@ -74,6 +73,10 @@ class CustomForce(Section):
     energy: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
     """Without a module: energy of a pair of sites (kJ/mol) as a function of their distance r (Å) and named parameters,
     such as A*exp(-B*r) - C/r**6; with exp, log, sqrt, sin, cos"""
+    table: Line | None = None
+    """Instead of an energy: a file in the folder of the scene with the columns r_A, energy_kJ_mol and perhaps
+    force_kJ_mol_A (-dE/dr), in lines of ascending r up to the cutoff. All keys of an energy are also those of a table;
+    its one parameter is scale, a factor of the energy; default: 1"""
     parameters: dict[str, Any] = Field(default={}, max_length=MOST_TABLES)
     """With a module: arguments with which its object is called. With an energy: numbers, the same for all sites, or a
     table of numbers for each kind of sites, by site, SPECIES.SITE or element; default: `parameters` in the models'
@@ -93,9 +96,11 @@ class CustomForce(Section):
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
     @model_validator(mode="after")
-    def _is_one_of_both(self):
-        if (self.module is None) == (self.energy is None):
-            raise ValueError("give a module, a Python file with the force, or an energy, a formula of r")
+    def _is_one_kind(self):
+        if sum(given is not None for given in (self.module, self.energy, self.table)) != 1:
+            raise ValueError(
+                "give a module, a Python file with the force, an energy, a formula of r, or a table, a file of energies"
+            )
         if self.module is not None:
             of_energy = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
@@ -128,7 +133,7 @@ class Forces(Section):
     """Custom forces"""
     tail_correction: Flag = False
     """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not"""
-    electrostatics: Literal["reaction_field", "ewald", "pme", "damped_shifted_force", "none"] = "reaction_field"
+    electrostatics: Literal[tuple(ELECTROSTATICS)] = "reaction_field"  # type: ignore[valid-type]
     """Coulomb forces: ewald and pme act on all periodic images, the others within the cutoff; none ignores charges"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
@@ -163,10 +168,10 @@ class Forces(Section):
     def _nothing_idle(self):
         if self.switch_start_A is not None and "switch" not in self.truncation:
             raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
-        fields, method = type(self).model_fields, self.electrostatics
-        for key, methods in ELECTROSTATIC_KEYS.items():
-            if getattr(self, key) != fields[key].default and method not in methods:
-                raise ValueError(f"{key} would do nothing with electrostatics = {method!r}")
+        fields, used = type(self).model_fields, ELECTROSTATICS[self.electrostatics].keys
+        for key in dict.fromkeys(key for method in ELECTROSTATICS.values() for key in method.keys):
+            if key not in used and getattr(self, key) != fields[key].default:
+                raise ValueError(f"{key} would do nothing with electrostatics = {self.electrostatics!r}")
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             raise ValueError("ewald_k2_max needs ewald_k_max too")
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:

@@ -298,27 +298,6 @@ def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[S
     return tuple(filled)
 
 
-def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
-    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order; species (n,)."""
-    sizes = np.array([len(array) for array in values])
-    begin, count = np.cumsum(sizes) - sizes, sizes[species]
-    rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
-    rows += np.arange(len(rows))
-    return np.concatenate(values)[rows]
-
-
-def sites_named(species: list[Molecule], name: str) -> list[np.ndarray]:
-    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one species."""
-    owner, _, site = name.rpartition(".")
-    for attribute in ("site_names", "elements"):
-        found = [
-            np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)]) for m in species
-        ]
-        if any(mask.any() for mask in found):
-            break
-    return found
-
-
 def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     """The entry of this name, or else of the element."""
     return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)

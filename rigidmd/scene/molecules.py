@@ -11,7 +11,7 @@ from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_errors
-from rigidmd.scene.forces import Forces
+from rigidmd.scene.forces import FORCE_FILES, Forces
 from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
@@ -268,8 +268,9 @@ class MolecularScene(Scene):
                 if (name := getattr(species, key)) is not None:
                     found[f"molecules.{k}.{key}"] = self.path(name)
         for k, force in enumerate(self.forces.custom):
-            if force.module is not None:
-                found[f"forces.custom.{k}.module"] = self.path(force.module)
+            for key in FORCE_FILES:
+                if (name := getattr(force, key)) is not None:
+                    found[f"forces.custom.{k}.{key}"] = self.path(name)
         return found
 
     @property
@@ -387,7 +388,7 @@ class MolecularScene(Scene):
         tables = [("structure", data.get("structure"), ("file", "topology"))]
         for name, entries, keys in (
             ("molecules", data.get("molecules"), SPECIES_FILES),
-            ("forces.custom", custom, ("module",)),
+            ("forces.custom", custom, FORCE_FILES),
         ):
             tables += [
                 (f"{name}.{k}", entry, keys) for k, entry in enumerate(entries if isinstance(entries, list) else ())

@@ -17,7 +17,7 @@ from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
-from rigidmd.forces.potentials.lennard_jones import Tail
+from rigidmd.forces.parts import Tail
 from rigidmd.scene.molecules import UserCode, name_of
 from rigidmd.scene.validation import did_you_mean
 
@@ -45,7 +45,7 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
     for k, entry in enumerate(scene.forces.custom):
         try:
             found.append(_custom(scene, entry, f"forces.custom.{k}"))
-        except SceneError as error:
+        except (SceneError, PairPotentialError) as error:
             faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.errors]
         except ValueError as error:
             faults.append((None, f"forces.custom.{k}: {error}"))
@@ -56,13 +56,13 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
 
 
 def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
-    if entry.energy is not None:
+    if entry.module is None:
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
+        table = None if entry.table is None else scene.path(entry.table)
         return pair_law(
-            entry.energy, entry.parameters or None, sites=entry.sites, pairs=pairs, mixing=entry.mixing,
+            entry.energy, entry.parameters or None, table=table, sites=entry.sites, pairs=pairs, mixing=entry.mixing,
             truncation=entry.truncation, cutoff_A=entry.cutoff_A, switch_start_A=entry.switch_start_A, name=entry.name,
         )  # fmt: skip
-    assert entry.module is not None  # or the entry is not validated
     module = trusted_module(scene.path(entry.module), f"{key}.module")
     if not hasattr(module, entry.name):
         there = [name for name in vars(module) if not name.startswith("_")]

@@ -4,25 +4,35 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, sqrt
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from rigidmd.core.files import unreadable_reason
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
 from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
+from rigidmd.forces.parts import Tail, gather_per_molecule, sites_named
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
     DISTANCE,
+    LEAST_ROWS,
     Formula,
     FormulaError,
     formula_of_function,
     formula_of_table,
     formula_of_text,
-)
-from rigidmd.forces.potentials.lennard_jones import Tail
-from rigidmd.forces.potentials.truncation import TRUNCATIONS, TruncationName, truncation_of, truncation_terms
-from rigidmd.scene.forces import MINIMUM_TOLERANCE, default_switch_start, short_cutoff_note
-from rigidmd.scene.models import Molecule, gather_per_molecule, sites_named
+)  # fmt: skip
+from rigidmd.forces.potentials.truncation import (
+    MINIMUM_TOLERANCE,
+    TRUNCATIONS,
+    TruncationName,
+    default_switch_start,
+    short_cutoff_note,
+    truncation_of,
+    truncation_terms,
+)  # fmt: skip
+from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean
 
 if TYPE_CHECKING:
@@ -33,8 +43,18 @@ RULES: tuple[str, ...] = get_args(Rule)
 Parameters = Mapping[str, float]
 #: A minimum is searched up to this multiple of the cutoff.
 REACH = 20.0
-#: A tabulated potential: distances (Å) and energies (kJ/mol).
-Columns = tuple[Sequence[float], Sequence[float]]
+#: Columns of the file of a tabulated potential, of which the last may be missing; the names have the units.
+COLUMNS = ("r_A", "energy_kJ_mol", "force_kJ_mol_A")
+LARGEST_TABLE, MOST_TABLE_ERRORS = 20_000_000, 5  # bytes; errors that are listed
+
+
+class Columns(NamedTuple):
+    """A tabulated potential."""
+
+    r: Sequence[float]  # Å
+    energy: Sequence[float]  # kJ/mol
+    force: Sequence[float] | None = None  # -dE/dr, kJ/mol/Å
+    name: str = "a table"  # for messages
 
 
 class PairPotentialError(ValueError):
@@ -66,7 +86,7 @@ class PairLaw:
         """The formula that is compiled. Raises PairPotentialError."""
         try:
             if self.table is not None:
-                return formula_of_table(*self.table, cutoff)
+                return formula_of_table(*self.table, cutoff=cutoff)
             if isinstance(self.energy, str):
                 return formula_of_text(self.energy, self.constants)
             assert self.formula_of_function is not None  # it has a text, a function or a table
@@ -285,9 +305,10 @@ def _has(energy: Any, formula: Formula, name: str) -> bool:
 
 def pair_law(
     energy: "str | Callable | None" = None, parameters: Mapping[str, Any] | None = None, *,
-    table: Columns | None = None, sites: Sequence[str] = (), pairs: Mapping[tuple[str, str], Any] | None = None,
-    mixing: Mapping[str, Rule] | None = None, truncation: TruncationName | None = None, cutoff_A: float | None = None,
-    switch_start_A: float | None = None, name: str = "",
+    table: "tuple[Sequence[float], ...] | str | Path | None" = None, sites: Sequence[str] = (),
+    pairs: Mapping[tuple[str, str], Any] | None = None, mixing: Mapping[str, Rule] | None = None,
+    truncation: TruncationName | None = None, cutoff_A: float | None = None, switch_start_A: float | None = None,
+    name: str = "",
 ) -> PairLaw:  # fmt: skip
     """A pair potential between sites of different molecules, for `Simulation(scene, forces=[...])`.
 
@@ -299,7 +320,8 @@ def pair_law(
     parameters : site -> parameters of sites of this kind, named by site, SPECIES.SITE or element: a dictionary, or the
         NamedTuple that a function expects. Or plain numbers, the same for all sites. Default: `parameters` of the sites
         in the models' files
-    table : instead of an energy, distances in Å and energies in kJ/mol, through which a spline is laid
+    table : instead of an energy, distances in Å, energies in kJ/mol and perhaps forces -dE/dr in kJ/mol/Å, which a
+        spline interpolates; or a file with these columns. Nearer than the first distance the energy rises as r⁻¹²
     sites : the only sites that it acts on
     pairs : (site, site) -> parameters of a pair, instead of mixed ones. Without `parameters`, it acts on them only
     mixing : parameter -> "geometric", "arithmetic" or "harmonic", the mean for unlike sites; default: arithmetic for
@@ -317,8 +339,12 @@ def pair_law(
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
-    if table is not None and not (isinstance(table, tuple | list) and len(table) == 2):
-        raise ValueError("table must be two lists: distances in Å, energies in kJ/mol")
+    if isinstance(table, str | Path):
+        columns = read_columns(Path(table))
+    elif table is not None and not (isinstance(table, tuple | list) and len(table) in (2, 3)):
+        raise ValueError("table must be a file, or two lists: distances in Å, energies in kJ/mol; a third has forces")
+    else:
+        columns = table and Columns(table[0], table[1], table[2] if len(table) > 2 else None)
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
     for parameter, rule in (mixing or {}).items():
@@ -354,9 +380,58 @@ def pair_law(
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
     formula = formula_of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
     return PairLaw(
-        energy, table, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
+        energy, columns, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
         switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
     )  # fmt: skip
+
+
+def read_columns(path: Path) -> Columns:
+    """The table of a file: numbers separated by commas or white space, comments after #, and perhaps a line with the
+    names of `COLUMNS` first. Raises PairPotentialError with all errors, up to MOST_TABLE_ERRORS."""
+    try:
+        reason = unreadable_reason(path, LARGEST_TABLE)
+        text = "" if reason else path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = f"cannot be read as text: {error}"
+    if reason:
+        raise PairPotentialError(f"{path}: {reason}")
+    names, rows, faults = COLUMNS, [], []
+    lines = [(k, line.partition("#")[0].replace(",", " ").split()) for k, line in enumerate(text.splitlines(), 1)]
+    lines = [(k, words) for k, words in lines if words]
+    if lines and not _is_number(lines[0][1][0]):
+        (number, given), lines = lines[0], lines[1:]
+        names = tuple(given)
+        if not {*COLUMNS[:2]} <= {*names} <= {*COLUMNS} or len({*names}) < len(names):
+            known = "r_A (Å), energy_kJ_mol (kJ/mol) and, if you like, force_kJ_mol_A (-dE/dr, kJ/mol/Å)"
+            raise PairPotentialError(f"{path}: line {number}: the columns are {', '.join(names)}; they must be {known}")
+    for number, words in lines:
+        values = [float(word) if _is_number(word) else inf for word in words]
+        row = dict(zip(names, values, strict=False))
+        if not 2 <= len(words) <= len(names) or (rows and len(words) != len(rows[0])):
+            expected = len(rows[0]) if rows else "2 or 3" if names == COLUMNS else len(names)
+            faults.append(f"line {number}: has {len(words)} numbers, must have {expected}: {', '.join(COLUMNS)}")
+        elif not all(map(isfinite, values)):
+            faults.append(f"line {number}: {' '.join(words):.60} has something else than finite numbers")
+        elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
+            least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance" if rows else "0"
+            faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")
+        else:
+            rows.append(row)
+    if not faults and len(rows) < LEAST_ROWS:
+        faults.append(f"has {len(rows)} rows, needs {LEAST_ROWS} or more: one line for each distance")
+    if faults:
+        more = [f"and {len(faults) - MOST_TABLE_ERRORS} more errors"] if len(faults) > MOST_TABLE_ERRORS else []
+        raise PairPotentialError(*(f"{path}: {fault}" for fault in [*faults[:MOST_TABLE_ERRORS], *more]))
+    r, energy, *force = ([row[name] for row in rows] for name in COLUMNS if name in rows[0])
+    return Columns(r, energy, force[0] if force else None, path.name)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _mapping(where: str, given: Any) -> Mapping[str, Any]:

@@ -18,9 +18,10 @@ from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, uns
 from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.forces.ewald.pme import Pme
+from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
-from rigidmd.scene.models import Molecule, gather_per_molecule
+from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import KJ_PER_MOL
 

@@ -16,15 +16,14 @@ from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
 from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
 from rigidmd.engines.mass_points import MassPoints, mass_points
 from rigidmd.engines.rigid_bodies import Points, RigidBodies
-from rigidmd.engines.system import charges_in
 from rigidmd.errors import EngineError
-from rigidmd.forces.ewald.errors import pme_grid_for, real_error
+from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.space import cell_of
+from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Switched, Unmodified
-from rigidmd.scene.models import gather_per_molecule
 from rigidmd.scene.stage import Stage
 from rigidmd.units import COULOMB, KJ_PER_MOL
 

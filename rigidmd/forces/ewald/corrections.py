@@ -19,6 +19,8 @@ class Background(NamedTuple):
 
     strength: float  # energy times the volume, u Å⁵/ps²
 
+    acts_on_charges = True
+
 
 def background(square: float, alpha: float) -> Background:
     """The term for the square of a net charge, in units where q²/r is an energy in u Å²/ps²."""
@@ -40,6 +42,8 @@ class SurfaceDipole(NamedTuple):
     strength: float  # 2 pi/(2 eps + 1)
     charge: np.ndarray  # (s,)
     sites: BodySites | CentralSites
+
+    acts_on_charges = True
 
     def workspace(self, setup: Setup) -> "SurfaceWorkspace":
         return SurfaceWorkspace(*self, *np.zeros((2, len(self.charge), 3)))

@@ -60,6 +60,8 @@ class EwaldSum(NamedTuple):
     sites: BodySites | CentralSites
     k_vectors: KVectors
 
+    acts_on_charges = True
+
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
         s, k_vectors = len(self.charge), self.k_vectors
         slots = -(-s // WIDTH) * WIDTH

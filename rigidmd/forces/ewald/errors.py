@@ -6,7 +6,7 @@ accuracy of kspace_style in LAMMPS.
 """
 
 from math import exp, pi, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -51,6 +51,14 @@ def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
         products.append(product)
         distances.append(np.round(distance, FINE))
     return Charges(count, square, _by_distance(np.concatenate(products), np.concatenate(distances)))
+
+
+def charges_in(species: list[Any], counts: np.ndarray) -> Charges:
+    """The charges of `counts` molecules of each species, each a `scene.models.Molecule`."""
+    charged = [(m, m.charges != 0) for m in species]
+    return charges_of(
+        [(int(n), m.charges[some], m.positions_body[some]) for n, (m, some) in zip(counts, charged, strict=True)]
+    )
 
 
 def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:

@@ -87,6 +87,8 @@ class Pme(NamedTuple):
     grid: tuple[int, int, int]  # points along a, b, c
     order: int  # of the splines
 
+    acts_on_charges = True
+
     def workspace(self, setup: Setup) -> "PmeWorkspace":
         grid, order = self.grid, self.order
         kind = np.dtype(setup.dtype)

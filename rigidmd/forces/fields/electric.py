@@ -14,15 +14,17 @@ positions = -(dE/dt) . M. Every kick adds this work over its part of the step to
 the momentum that is conjugate to time as a coordinate, so energy less work is conserved as well as any Hamiltonian.
 """
 
-from math import cos, sin
-from typing import NamedTuple
+from math import cos, pi, radians, sin
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import NOW, OK
+from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces, energy_rate
 from rigidmd.mechanics.translation import body_component
+from rigidmd.units import VOLT_PER_NM
 
 
 class ElectricField(NamedTuple):
@@ -57,6 +59,23 @@ class OscillatingField(NamedTuple):
     time_dependent = True
     changes_momentum = ElectricField.changes_momentum
     tied_to_places = ElectricField.tied_to_places
+
+
+def term(
+    parts: SystemParts, fields: Any, where: str, faults: list[str]
+) -> ElectricField | OscillatingField | None:  # fmt: skip
+    """The term of fields.electric_V_per_nm."""
+    if not any(fields.electric_V_per_nm):
+        return None
+    charge = np.where(parts.moves, [m.charge for m in parts.species], 0.0)
+    dipole = np.where(parts.moves[:, None], [m.charges @ m.positions_body for m in parts.species], 0.0)
+    present = np.unique(parts.model.species)
+    if not (charge[present].any() or dipole[present].any()):
+        faults.append(f"{where} would do nothing: no molecule that moves has a charge")
+    steady = ElectricField(parts.model.species, charge, dipole, np.array(fields.electric_V_per_nm) * VOLT_PER_NM)
+    if fields.electric_frequency_per_ps is None:
+        return steady
+    return OscillatingField(*steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg))
 
 
 @implements(add_forces)

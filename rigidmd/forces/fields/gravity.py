@@ -1,12 +1,14 @@
 """A uniform gravitational field on molecules."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
+from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
+from rigidmd.units import METRE_PER_S2
 
 
 class Gravity(NamedTuple):
@@ -22,6 +24,14 @@ class Gravity(NamedTuple):
     def changes_momentum(self) -> np.ndarray:
         """Components (3,) of the total momentum that it changes."""
         return self.acceleration != 0
+
+
+def term(parts: SystemParts, fields: Any, where: str, faults: list[str]) -> Gravity | None:
+    """The term of fields.gravity_m_s2."""
+    if not any(fields.gravity_m_s2):
+        return None
+    mass = np.where(parts.moves, parts.model.mass, 0.0)
+    return Gravity(parts.model.species, mass, np.array(fields.gravity_m_s2) * METRE_PER_S2)
 
 
 @implements(add_forces, Gravity)

@@ -1,12 +1,14 @@
 """Harmonic restraints of the centres of mass of some molecules to reference positions in the lab."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
+from rigidmd.forces.parts import SystemParts, select_by_number
 from rigidmd.forces.terms import add_forces
+from rigidmd.units import KJ_PER_MOL
 
 
 class Restraints(NamedTuple):
@@ -22,6 +24,42 @@ class Restraints(NamedTuple):
     def changes_momentum(self) -> np.ndarray:
         """Components (3,) of the total momentum that they change."""
         return self.stiffness != 0
+
+
+def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> Restraints | None:
+    """The term of one of fields.restraints."""
+    index, names = parts.model.species, list(dict.fromkeys(m.name for m in parts.species))
+    name = entry.species or names[0]
+    of_species = np.array([m.name == name for m in parts.species])[index]
+    if entry.species is None and len(names) > 1:
+        faults.append(f"{where}.species is required: there are {', '.join(names)}")
+    elif name not in names:
+        faults.append(f"{where}.species: there is no {name!r}; there are {', '.join(names)}")
+    elif not of_species.any():
+        faults.append(f"{where}.species: the structure file has no {name}")
+    else:
+        return _restraints(parts, entry, where, faults, name, of_species)
+    return None
+
+
+def _restraints(
+    parts: SystemParts, entry: Any, where: str, faults: list[str], name: str, of_species: np.ndarray
+) -> Restraints | None:
+    moves = parts.moves[parts.model.species]
+    restrained = of_species & moves if entry.molecules is None else np.zeros(len(moves), bool)
+    for numbers, mask, fault in select_by_number(entry.spans, name, of_species, parts.number):
+        if fault:
+            faults.append(f"{where}.molecules: {fault}")
+        elif not moves[mask].all():
+            faults.append(f"{where}.molecules: {numbers} includes frozen molecules, which do not move")
+        restrained |= mask
+    if not restrained.any():
+        if entry.molecules is None:
+            faults.append(f"{where} would do nothing: all {name} are frozen")
+        return None
+    molecule = np.flatnonzero(restrained)
+    position = parts.state.position[molecule] if entry.position_A is None else [entry.position_A] * len(molecule)
+    return Restraints(molecule, np.array(position, float), np.array(entry.stiffness) * KJ_PER_MOL)
 
 
 @implements(add_forces, Restraints)

@@ -9,15 +9,21 @@ epsilon at (2/5)^(1/6) sigma. It is not defined on and behind the wall: a site t
 BEHIND_WALL. The harmonic wall is soft; `fix wall/harmonic` of LAMMPS has no factor 1/2.
 """
 
-from math import isnan
-from typing import NamedTuple
+from math import inf, isnan
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site, sites_of
+from rigidmd.forces.neighbors.space import Orthorhombic, Unbounded
+from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces
+from rigidmd.units import KJ_PER_MOL
+
+#: Distance of the well of a Lennard-Jones wall, in sigma, at which a lattice of molecules begins.
+WELL = (2 / 5) ** (1 / 6)
 
 
 class LennardJonesWalls(NamedTuple):
@@ -76,6 +82,80 @@ class SiteBehindWall(NamedTuple):
         return f"has a site at {axis} = {self.coordinate:.6g} Å, behind the wall at {axis} = {self.wall:g} Å"
 
 
+def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> LennardJonesWalls | HarmonicWalls:
+    """The term of one of fields.walls. The messages on the gap between walls follow those on the last of them."""
+    points, index = _acted_on(walls, parts.species, parts.moves), parts.model.species
+    faults += [
+        f"{where}: {m.name} has no site with Lennard-Jones parameters, and would pass the walls; "
+        "use acts_on = 'centres'"
+        for m, offsets, free in zip(parts.species, points, parts.moves, strict=True)
+        if free and not len(offsets)
+    ]
+    sites = sites_of(index, points, parts.model.inverse_inertia)
+    positions = (walls.direction, *walls.positions_A)
+    if walls.kind == "harmonic":
+        found = HarmonicWalls(*positions, walls.stiffness_kJ_mol_A2 * KJ_PER_MOL, sites)
+    else:
+        epsilon, cutoff = walls.epsilon_kJ_mol * KJ_PER_MOL, walls.cutoff_A or inf
+        found = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
+        if (behind := found.behind(parts.state)) is not None:
+            name = parts.species[index[behind.molecule]].name
+            faults.append(f"{where}: at the start, molecule {behind.molecule + 1} ({name}) {behind}")
+    if walls is parts.scene.fields.walls[-1]:
+        faults += _gap_errors(parts)
+    return found
+
+
+def _acted_on(walls: Any, species: list[Any], moves: np.ndarray) -> list[np.ndarray]:
+    """Points (k, 3) of each species on which walls act, body frame, Å; none of frozen species."""
+    offsets = [np.zeros((1, 3)) if walls.acts_on == "centres" else m.positions_body[m.epsilon > 0] for m in species]
+    return [points if free else points[:0] for points, free in zip(offsets, moves, strict=True)]
+
+
+def _gap_errors(parts: SystemParts) -> list[str]:
+    """Messages on walls that do not fit into a periodic box, or too close to their periodic images."""
+    fields, space = parts.scene.fields, parts.space
+    if isinstance(space, Unbounded):
+        return []
+    if not isinstance(space, Orthorhombic):
+        return ["fields.walls need a box with right angles, or none"]
+    faults, cutoff = [], parts.scene.forces.cutoff_A or inf
+    for axis, name in enumerate("xyz"):
+        if (bounds := fields.bounds(axis)) is None:
+            continue
+        protrusion = min(_protrusion(walls, parts) for walls in fields.walls if walls.direction == axis)
+        width, edge = bounds[1] - bounds[0], space.edges[axis]
+        least = width + 2 * protrusion + cutoff
+        if edge < least:
+            sites = f", {2 * protrusion:.3g} Å by which sites may protrude," if protrusion else ""
+            faults.append(
+                f"fields.walls: along {name} the box is {edge:g} Å, and must be {least:.6g} Å at least: {width:g} Å "
+                f"between the walls{sites} and the cutoff of {cutoff:g} Å, so that molecules at one wall do not "
+                "interact with periodic images of molecules at the other"
+            )
+    return faults
+
+
+def _protrusion(walls: Any, parts: SystemParts) -> float:
+    """Largest distance of interacting sites from the points on which walls act, Å."""
+    found = 0.0
+    for m, points in zip(parts.species, _acted_on(walls, parts.species, parts.moves), strict=True):
+        acting = m.positions_body[(m.epsilon > 0) | (m.charges != 0)]
+        if len(points) and len(acting):
+            distance = np.linalg.norm(acting[:, None] - points, axis=2).min(axis=1)
+            found = max(found, float(distance.max()))
+    return found
+
+
+def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:
+    """Range (lower, upper) of centres of mass that is free for every orientation between walls, Å."""
+    points = np.concatenate(_acted_on(walls, species, np.ones(len(species), bool)))
+    margin = float(np.linalg.norm(points, axis=1).max(initial=0.0)) + (
+        WELL * walls.sigma_A if walls.kind == "lj93" else 0.0
+    )
+    return walls.positions_A[0] + margin, walls.positions_A[1] - margin
+
+
 def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
     """Coordinates (s,) of the sites across the walls, Å."""
     m = walls.sites.molecule
@@ -85,13 +165,9 @@ def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
     return x + np.einsum("sj,sj->s", state.rotation[m, walls.axis], walls.sites.offsets())
 
 
+@chosen_by_type(inline=True)
 def add_site_force(sites, state, load, m, i, axis, force):
     """Add a force along a lab axis on site i of molecule m to the force and torque on the molecule."""
-    raise TypeError("compiled code only")
-
-
-@implements(add_site_force, inline=True)
-def _add_site_force(sites, state, load, m, i, axis, force):
     if is_a(sites, CentralSites):
 
         def push_centre(sites, state, load, m, i, axis, force):

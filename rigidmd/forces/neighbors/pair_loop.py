@@ -47,6 +47,11 @@ class PairForces(NamedTuple):
     sites: BodySites | CentralSites
     group: np.ndarray  # (s,) sites of one group do not interact
 
+    @property
+    def acts_on_charges(self) -> bool:
+        """Whether its potential is an interaction of charges."""
+        return getattr(self.potential, "acts_on_charges", False)
+
     def workspace(self, setup: Setup) -> "PairWorkspace":
         potential, sites = self.potential, self.sites
         reach = _diameter(sites) if np.array_equal(self.group, sites.molecule) else inf

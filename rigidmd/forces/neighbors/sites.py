@@ -131,13 +131,9 @@ def _site_vector(vectors, i):
     return from_slot
 
 
+@chosen_by_type(inline=True)
 def locate_site(sites, state, m, i):
     """Position (x, y, z) of site i of molecule m, lab frame, Å."""
-    raise TypeError("compiled code only")
-
-
-@implements(locate_site, inline=True)
-def _locate_site(sites, state, m, i):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, i: (state.position[m, 0], state.position[m, 1], state.position[m, 2])
 
@@ -149,13 +145,9 @@ def _locate_site(sites, state, m, i):
     return locate_site
 
 
+@chosen_by_type(inline=True)
 def predict_site(sites, state, m, i, lead):
     """Position of site i of molecule m after a time `lead` at constant velocity and angular velocity, Å."""
-    raise TypeError("compiled code only")
-
-
-@implements(predict_site, inline=True)
-def _predict_site(sites, state, m, i, lead):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, i, lead: (
             state.position[m, 0] + lead * state.velocity[m, 0],
@@ -332,13 +324,9 @@ def _virial_of_molecules(sites, code, state, site_force, virial, tally):
     return to_molecular_virial
 
 
+@chosen_by_type(inline=True)
 def _add_offset_virial(sites, state, m, site_force, virial):
     """Add f (x) (x_site - X_molecule) of the sites of a molecule to nine numbers."""
-    raise TypeError("compiled code only")
-
-
-@implements(_add_offset_virial, inline=True)
-def _add_offset_virial_of(sites, state, m, site_force, virial):
     if is_a(sites, CentralSites):
         return lambda sites, state, m, site_force, virial: None
 

@@ -9,6 +9,7 @@ import numpy as np
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.forces.potentials.truncation import (
     NO_SWITCH, SWITCHES, SwitchCorrection, SwitchTerm, Truncation, TruncationName, TruncationTerms, correction,
     needs_root, switch_correction_of, switch_term, switch_term_of, truncated, truncation_of, truncation_terms,
@@ -27,6 +28,8 @@ class ReactionField(NamedTuple):
     field: float  # 1/Å³
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
     switched: SwitchTerm | SwitchCorrection | tuple[()] = NO_SWITCH
+
+    acts_on_charges = True
 
     def for_slots(self, slots: int, dtype: type) -> "ReactionField":
         """The potential with an array for the charges in slots, in the precision of the pair loop."""
@@ -54,13 +57,23 @@ def reaction_field(
     return ReactionField(cutoff, truncation, terms, field, charge_e * COULOMB_CHARGE)
 
 
+def interactions(parts: SystemParts) -> Interactions:
+    """The charges of a scene with electrostatics = "reaction_field"."""
+    forces, charged = parts.scene.forces, parts.charged
+    cutoff = forces.cutoff_A or inf
+    start = forces.switch_start_A or cutoff
+    potential = reaction_field(charged.charge_e, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
+    terms, constants = {"coulomb": parts.pair_forces(potential, charged.sites)}, {}
+    if cutoff < inf:
+        constants["reaction_field_self"] = charged.sum_over_molecules(
+            lambda q, x: self_energy(potential._replace(charge=q), x)
+        )
+    return Interactions(terms, constants)
+
+
+@chosen_by_type(inline=True)
 def powers(truncation, switched, r2):
     """1/r, and two factors of 1/r³; found without 1/r if the force does not need it."""
-    raise TypeError("compiled code only")
-
-
-@implements(powers, inline=True)
-def _powers_of(truncation, switched, r2):
     if not needs_root(truncation, switched):
         return lambda truncation, switched, r2: inverse_root_and_cube(r2)
 

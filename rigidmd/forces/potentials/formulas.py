@@ -16,7 +16,7 @@ from operator import add, mul, sub, truediv
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 
 from rigidmd.compile import implements, is_a
 from rigidmd.compile.kernels import compile_user_function
@@ -38,6 +38,10 @@ MAX_DIGITS = 300  #: decimal digits of numbers in a formula, before or behind th
 #: Function of a distance (Å) that gives the energy v, -v' and -v'', in u Å²/ps².
 Radial = Callable[[float], tuple[float, float, float]]
 STEPS = 4096  #: intervals of r² in a table, equally spaced
+LEAST_ROWS = 8  #: of a table of a user
+#: Largest difference of an energy and the trapezoidal integral of its force between two rows, relative to the largest
+#: change of the energy between rows.
+WRONG_FORCE = 0.3
 
 
 class Formula(NamedTuple):
@@ -502,42 +506,60 @@ def _class_for(kind: type, function: Callable) -> type:
 # --- from a table ----------------------------------------------------------------------------------------------------
 
 
-def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff: float) -> Formula:
+def formula_of_table(
+    distance: Sequence[float], energy: Sequence[float], force: Sequence[float] | None = None, name: str = "a table",
+    cutoff: float = inf,
+) -> Formula:  # fmt: skip
     """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cutoff.
 
-    The table is interpolated by a cubic spline, and tabulated again at equal steps of r² for the pair loop. The force
-    is the derivative of that table. `error` is the error of the spline, estimated by one through every second value
-    and divided by 16 for its order, plus the error of the second table. Raises FormulaError.
+    The table is interpolated by a cubic spline, or by cubics with the given forces -dE/dr (kJ/mol/Å) at the distances,
+    and tabulated again at equal steps of r² for the pair loop. The force is the derivative of that table. Nearer than
+    the first distance a the energy is E(a) + a F(a)/12 ((a/r)¹² - 1), down to a/2, and a straight line in r² below.
+    `error` is the error of the spline, estimated by one through every second value and divided by 16 for its order,
+    plus the error of the second table. Raises FormulaError.
     """
     try:
         r, u = np.asarray(distance, float), np.asarray(energy, float)
+        f = None if force is None else np.asarray(force, float)
     except (TypeError, ValueError):
-        raise FormulaError("a table is two lists of numbers: distances in Å, energies in kJ/mol") from None
-    if r.ndim != 1 or r.shape != u.shape or len(r) < 8:
+        raise FormulaError(f"{name} is two lists of numbers: distances in Å, energies in kJ/mol") from None
+    if r.ndim != 1 or r.shape != u.shape or len(r) < LEAST_ROWS or (f is not None and f.shape != r.shape):
         raise FormulaError(
-            f"a table needs 8 distances or more, with one energy each; these are {r.shape} and {u.shape}"
+            f"{name} needs {LEAST_ROWS} distances or more, with one energy each; these are {r.shape} and {u.shape}"
         )
-    if not (np.isfinite(r).all() and np.isfinite(u).all() and (np.diff(r) > 0).all() and r[0] > 0):
-        raise FormulaError("a table needs ascending distances above 0, and finite energies")
+    finite = np.isfinite(r).all() and np.isfinite(u).all() and (f is None or np.isfinite(f).all())
+    if not (finite and (np.diff(r) > 0).all() and r[0] > 0):
+        raise FormulaError(f"{name} needs ascending distances above 0, and finite energies")
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
-        raise FormulaError(f"the table ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å")
-    spline = CubicSpline(r, u * KJ_PER_MOL)
-    if not float(spline(r[0], 1)) < 0:
-        raise FormulaError(f"the table begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances")
+        unit = "; is it in nm?" if 10 * r[-1] >= cutoff else ""
+        raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
+
+    def interpolated(rows: slice) -> PPoly:
+        values = KJ_PER_MOL * u[rows]
+        return CubicSpline(r[rows], values) if f is None else CubicHermiteSpline(r[rows], values, -KJ_PER_MOL * f[rows])
+
+    spline, coarse = interpolated(slice(None)), interpolated(slice(None, None, 2))
+    slope = spline(r[[0, -1]], 1) / (2 * r[[0, -1]])  # by r²
+    if not slope[0] < 0:
+        raise FormulaError(f"{name} begins at {r[0]:g} Å, where it does not repel: begin it at shorter distances")
     square = np.linspace(r[0] ** 2, r[-1] ** 2, STEPS + 1)
-    root = np.sqrt(square)
-    read = CubicSpline(
-        square, spline(root), bc_type=((1, spline(r[0], 1) / (2 * r[0])), (1, spline(r[-1], 1) / (2 * r[-1])))
-    )
+    read = CubicSpline(square, spline(np.sqrt(square)), bc_type=((1, slope[0]), (1, slope[1])))
     step = square[1] - square[0]
-    coefficients = np.ascontiguousarray((read.c[::-1] * step ** np.arange(4)[:, None]).T).ravel()
     middle = np.sqrt(0.5 * (square[1:] + square[:-1]))
     size = np.abs(u[u <= 0]).max(initial=0.0) * KJ_PER_MOL or np.abs(u).max() * KJ_PER_MOL
     near = middle[spline(middle) < 10 * size]
-    coarse = CubicSpline(r[::2], u[::2] * KJ_PER_MOL)
     near = near[near <= r[::2][-1]]
     error = np.abs(coarse(near) - spline(near)).max(initial=0.0) / 16
     error += np.abs(read(near**2) - spline(near)).max(initial=0.0)
+    if f is not None:
+        _check_forces(name, r, u, f, 10 * size / KJ_PER_MOL)
+    if (steps := int(0.75 * square[0] / step)) > 0:
+        inner = square[0] - step * np.arange(steps, -1, -1.0)
+        six = (square[0] / inner) ** 6
+        energies = spline(r[0]) - slope[0] * square[0] / 6 * (six - 1)
+        wall = CubicHermiteSpline(inner, energies, slope[0] * six * square[0] / inner)
+        read = PPoly(np.hstack([wall.c, read.c]), np.concatenate([inner, square[1:]]))
+    coefficients = np.ascontiguousarray((read.c[::-1] * step ** np.arange(4)[:, None]).T).ravel()
 
     def radial(values: Mapping[str, float]) -> Radial:
         scale = values["scale"]
@@ -549,6 +571,18 @@ def formula_of_table(distance: Sequence[float], energy: Sequence[float], cutoff:
 
         return value
 
-    table = Table(float(square[0]), float(1 / step), coefficients)
-    text = f"a table of {len(r)} energies from {r[0]:g} to {r[-1]:g} Å"
+    table = Table(float(read.x[0]), float(1 / step), coefficients)
+    text = f"{name} of {len(r)} energies from {r[0]:g} to {r[-1]:g} Å"
     return Formula(text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, float(error / size))
+
+
+def _check_forces(name: str, r: np.ndarray, u: np.ndarray, f: np.ndarray, high: float) -> None:
+    """Raise FormulaError if forces f are not -du/dr between the rows with energies up to `high`."""
+    gained, mean = np.diff(u), 0.5 * (f[1:] + f[:-1]) * np.diff(r)
+    off = np.where(np.maximum(u[1:], u[:-1]) <= high, np.abs(gained + mean), 0.0)
+    k = int(off.argmax())
+    if off[k] > WRONG_FORCE * np.abs(gained).max(where=u[:-1] <= high, initial=0.0):
+        raise FormulaError(
+            f"{name}: the forces are not -dE/dr. From {r[k]:g} to {r[k + 1]:g} Å the energy changes by {gained[k]:.4g} "
+            f"kJ/mol, with these forces it would by {-mean[k]:.4g}. Have they another sign or unit?"
+        )

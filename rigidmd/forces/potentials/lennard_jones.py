@@ -1,7 +1,7 @@
 """Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with truncation, mixing rules and tail correction."""
 
 # isort: skip_file
-from math import pi
+from math import inf, pi
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,12 +9,15 @@ from scipy.integrate import quad
 
 from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, zeros
+from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.parts import Interactions, SystemParts, Tail, gather_per_molecule, sites_named
 from rigidmd.forces.potentials.truncation import (
-    NO_SWITCH, SWITCH_FUNCTIONS, ForceShifted, SwitchCorrection, SwitchTerm, Truncation, TruncationName,
-    TruncationTerms, Unmodified, correction, needs_root, switch_correction_of, switch_term, switch_term_of, truncated,
-    truncation_of, truncation_polynomial, truncation_terms,
+    MINIMUM_TOLERANCE, NO_SWITCH, SWITCH_FUNCTIONS, ForceShifted, SwitchCorrection, SwitchTerm, Truncation,
+    TruncationName, TruncationTerms, Unmodified, correction, needs_root, short_cutoff_note, switch_correction_of,
+    switch_term, switch_term_of, truncated, truncation_of, truncation_polynomial, truncation_terms,
 )  # fmt: skip
+from rigidmd.units import KJ_PER_MOL
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
 
@@ -96,6 +99,74 @@ def lennard_jones(
     )  # fmt: skip
 
 
+def interactions(parts: SystemParts) -> Interactions:
+    """The Lennard-Jones forces of a scene, with forces.lennard_jones. Raises SceneError."""
+    forces, species, index = parts.scene.forces, parts.species, parts.model.species
+    named = _sites_of_pairs(parts)
+    indices = [np.flatnonzero((m.epsilon > 0) | named[k].any(axis=(0, 1))) for k, m in enumerate(species)]
+    if not forces.lennard_jones or not any(len(c) for c in indices):
+        return Interactions({}, {})
+    entries = [
+        [(m.sigma[i], m.epsilon[i], tuple(named[k][:, :, i].ravel())) for i in c]
+        for k, (m, c) in enumerate(zip(species, indices, strict=True))
+    ]
+    kinds = sorted({entry for of_species in entries for entry in of_species})
+    of_species = [np.array([kinds.index(entry) for entry in of_sites], np.int32) for of_sites in entries]
+    kind = gather_per_molecule(of_species, index)
+    sigma, epsilon = np.array([entry[:2] for entry in kinds]).T
+    special = {
+        (i, j): (entry.sigma_A, entry.epsilon_kJ_mol * KJ_PER_MOL)
+        for n, entry in enumerate(forces.pairs)
+        for i, (_, _, one) in enumerate(kinds)
+        for j, (_, _, other) in enumerate(kinds)
+        if one[2 * n] and other[2 * n + 1]
+    }
+    cutoff = forces.cutoff_A or inf
+    start = forces.switch_start_A or cutoff
+    with np.errstate(over="ignore", invalid="ignore"):  # checked below
+        potential = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
+    if not (np.isfinite(potential.c12).all() and np.isfinite(potential.c6).all()):
+        raise SceneError(parts.scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
+    names = [
+        np.array([f"{m.name}.{m.site_names[i]}" for i in c], object) for m, c in zip(species, indices, strict=True)
+    ]
+    return Interactions(
+        {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))}, {},
+        tail=tail(potential) if forces.tail_correction else None,
+        notes=_short_cutoff_notes(potential, gather_per_molecule(names, index)),
+    )  # fmt: skip
+
+
+def _sites_of_pairs(parts: SystemParts) -> list[np.ndarray]:
+    """Masks (pairs, 2, sites) for each species: whether the first or second name of forces.pairs means the site. Raises
+    SceneError."""
+    entries, species, faults = parts.scene.forces.pairs, parts.species, []
+    found = [np.zeros((len(entries), 2, len(m.site_names)), bool) for m in species]
+    for n, entry in enumerate(entries):
+        for side, text in enumerate(entry.sites):
+            masks = sites_named(species, text)
+            for k, mask in enumerate(masks):
+                found[k][n, side] = mask
+            if not any(mask.any() for mask in masks):
+                known = dict.fromkeys(f"{m.name}.{site}" for m in species for site in m.site_names)
+                faults.append(f"forces.pairs.{n}.sites: no site is {text!r}; there are {', '.join(known)}")
+    if faults:
+        raise SceneError(parts.scene.source, faults)
+    return found
+
+
+def _short_cutoff_notes(potential: LennardJones, name: np.ndarray) -> tuple[str, ...]:
+    """A note if the cutoff is below the minimum of an energy, on the pair with the most distant minimum. name (s,) : of
+    the sites"""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        minimum = np.nan_to_num((2 * potential.c12 / potential.c6) ** (1 / 6), posinf=0.0)
+    i, j = np.unravel_index(minimum.argmax(), minimum.shape)
+    if not potential.cutoff < (1 - MINIMUM_TOLERANCE) * minimum[i, j]:
+        return ()
+    first, second = (name[np.flatnonzero(potential.kind == kind)[0]] for kind in (i, j))
+    return (short_cutoff_note(potential.cutoff, f"{first} and {second}", float(minimum[i, j])),)
+
+
 def _inverse_power(p: int):
     """Function of r that gives r⁻ᵖ, its force and the derivative of its force."""
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
@@ -156,13 +227,9 @@ def _energy_and_force(potential, c12, c6, r2):
     return of_one
 
 
+@chosen_by_type(inline=True)
 def inverses(truncation, switched, r2):
     """(1/r², 1/r) at squared distances r2; 1/r is 0 if it is not needed, to save the square root."""
-    raise TypeError("compiled code only")
-
-
-@implements(inverses, inline=True)
-def _inverses(truncation, switched, r2):
     if not needs_root(truncation, switched):
         return lambda truncation, switched, r2: (inverse(r2), 0.0)
 
@@ -197,26 +264,6 @@ def _arrange(potential, slot_potential, order):
                 slot_potential.c6[k * len(order) + slot] = potential.c6[k, potential.kind[i]]
 
     return arrange
-
-
-class Tail(NamedTuple):
-    """Tail correction: the energy and pressure beyond the cutoff, at any volume."""
-
-    energy_volume: float  # energy times the volume, u Å⁵/ps²
-    pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
-
-    def energy(self, volume: float) -> float:
-        """u Å²/ps²"""
-        return self.energy_volume / volume
-
-    def pressure(self, volume: float) -> float:
-        """u/(Å ps²)"""
-        return self.pressure_square / volume**2
-
-
-def sum_of_tails(tails: list[Tail]) -> Tail | None:
-    """Sum of the tail corrections, or None if there are none."""
-    return Tail(*np.sum(tails, axis=0).tolist()) if tails else None
 
 
 def tail(potential: LennardJones) -> Tail:

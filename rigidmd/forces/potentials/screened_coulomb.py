@@ -11,7 +11,7 @@ terms that it would need, and the force is 30 times as accurate; without any scr
 """
 
 # isort: skip_file
-from math import exp, pi, sqrt
+from math import exp, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,10 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.compile.simd import (
     HAS_AVX512, inverse_root_and_cube, inverse_square_root, load, permute_two, polynomial, split_integer_part, zeros,
 )  # fmt: skip
+from rigidmd.forces.ewald.errors import MAX_ALPHA_CUTOFF
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.neighbors.space import Space
+from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.units import COULOMB_CHARGE
 
 #: Largest error of a polynomial, relative to the function at r = 0, by precision: below the rounding error of its
@@ -138,6 +141,8 @@ class ScreenedCoulomb(NamedTuple):
     screening: Screening | TabledScreening
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
+    acts_on_charges = True
+
     def for_slots(self, slots: int, dtype: type) -> "ScreenedCoulomb":
         """The potential with an array for the charges in slots, in the precision of the pair loop."""
         error = self.error if dtype == np.float32 else 0.0
@@ -169,6 +174,8 @@ class DampedShiftedForce(NamedTuple):
     shift: float  # 1/Å, the constant part
     charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
 
+    acts_on_charges = True
+
     def for_slots(self, slots: int, dtype: type) -> "DampedShiftedForce":
         """The potential with an array for the charges in slots, in the precision of the pair loop."""
         fitted = screening_of_lanes(self.alpha, self.cutoff, dtype)
@@ -183,14 +190,35 @@ def damped_shifted_force(charge_e: np.ndarray, cutoff: float, alpha: float) -> D
     return DampedShiftedForce(cutoff, alpha, screening(alpha, cutoff), slope, shift, charge_e * COULOMB_CHARGE)
 
 
+def setting_errors(forces, space: Space, cutoff: float) -> list[str]:
+    """Messages on the keys of [forces] of electrostatics = "damped_shifted_force"."""
+    if cutoff == inf:
+        return ["forces.electrostatics = 'damped_shifted_force' needs a cutoff; give forces.cutoff_A"]
+    return screening_errors("damping_per_A", forces.damping_per_A, cutoff)
+
+
+def screening_errors(key: str, alpha: float | None, cutoff: float) -> list[str]:
+    """A message on a key of [forces] that screens charges by alpha (1/Å) far below rounding at a cutoff (Å)."""
+    if alpha is None or not alpha * cutoff > MAX_ALPHA_CUTOFF:
+        return []
+    return [
+        f"forces.{key} = {alpha:g} with a cutoff of {cutoff:g} Å screens charges there by erfc({alpha * cutoff:.3g}), "
+        f"far below rounding; at most {MAX_ALPHA_CUTOFF / cutoff:.3g} is of use"
+    ]
+
+
+def interactions(parts: SystemParts) -> Interactions:
+    """The charges of a scene with electrostatics = "damped_shifted_force"."""
+    forces, charged = parts.scene.forces, parts.charged
+    potential = damped_shifted_force(charged.charge_e, forces.cutoff_A or inf, forces.damping_per_A)
+    constant = charged.sum_over_molecules(lambda q, x: damped_self_energy(potential._replace(charge=q), x))
+    return Interactions({"coulomb": parts.pair_forces(potential, charged.sites)}, {"damped_self": constant})
+
+
+@chosen_by_type(inline=True)
 def screened(screening, inverse, cube, r2):
     """(energy, force/r) of two unit charges with erfc(alpha r)/r, from 1/r, two factors of 1/r³, and r². For scalars
     `screening` must not be a table. Valid up to the cutoff."""
-    raise TypeError("compiled code only")
-
-
-@implements(screened, inline=True)
-def _screened(screening, inverse, cube, r2):
     if is_a(screening, Screening):
 
         def by_polynomials(screening, inverse, cube, r2):

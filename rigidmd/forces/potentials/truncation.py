@@ -161,13 +161,9 @@ def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype
     return SwitchCorrection(tuple(chebyshev.cheb2poly(found[:count]).tolist()))
 
 
+@chosen_by_type(inline=True)
 def switch_term(truncation, switched, r):
     """A `SwitchTerm` at distances r; 0 below the start, and for anything else."""
-    raise TypeError("compiled code only")
-
-
-@implements(switch_term, inline=True)
-def _switch_term(truncation, switched, r):
     if not is_a(switched, SwitchTerm):
         return lambda truncation, switched, r: 0.0
     power = squared if is_a(truncation, Switched) else to_the_fourth
@@ -179,13 +175,9 @@ def _switch_term(truncation, switched, r):
     return switch_term
 
 
+@chosen_by_type(inline=True)
 def correction(truncation, switched, r2):
     """A `SwitchCorrection` at squared distances r2; 0 below the start, and for anything else."""
-    raise TypeError("compiled code only")
-
-
-@implements(correction, inline=True)
-def _correction(truncation, switched, r2):
     if not is_a(switched, SwitchCorrection):
         return lambda truncation, switched, r2: 0.0
 
@@ -281,3 +273,20 @@ def nonic(truncation, r):
 
 
 SWITCH_FUNCTIONS = {Switched: quintic, SmoothlySwitched: nonic}
+
+#: A cutoff this close to the minimum of an energy, as a fraction, is the rounded minimum of a repulsive potential.
+MINIMUM_TOLERANCE = 0.01
+
+
+def short_cutoff_note(cutoff: float, sites: str, minimum: float) -> str:
+    """A note on a cutoff (Å) below the minimum of the energy of two sites."""
+    unit = "Is it in nm? " if cutoff < 2 < minimum else ""
+    return (
+        f"a cutoff of {cutoff:g} Å is shorter than {minimum:.3g} Å, where the energy of {sites} has its minimum: they "
+        f"only repel each other, and no liquid holds together. {unit}A usual cutoff is {2.2 * minimum:.2g} Å or more"
+    )
+
+
+def default_switch_start(truncation: str, cutoff: float) -> float:
+    """The default of switch_start_A, Å."""
+    return 0.6 * cutoff if truncation == "smooth_switch" else max(0.9 * cutoff, cutoff - 1.0)

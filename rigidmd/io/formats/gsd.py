@@ -21,10 +21,10 @@ from rigidmd.core.files import atomic_file, create_empty_file
 from rigidmd.core.state import State
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
+from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.io.bonds import charges, connections
 from rigidmd.io.formats.frame_file import FrameFile, reason_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
-from rigidmd.scene.models import gather_per_molecule
 
 #: Logged quantity with the time of a frame, ps, which the schema lacks.
 TIME = "time_ps"

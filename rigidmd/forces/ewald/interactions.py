@@ -1,0 +1,222 @@
+"""Ewald sums of a scene, electrostatics = "ewald" and "pme": settings, terms, constants of rigid molecules."""
+
+from math import inf, pi, prod, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.errors import SceneError
+from rigidmd.forces.ewald import corrections, direct_sum, k_vectors
+from rigidmd.forces.ewald.errors import (
+    MAX_ALPHA_CUTOFF,
+    MAX_GRID_POINTS,
+    SPACINGS,
+    alpha_for,
+    charges_in,
+    k_cutoff_for,
+    k_cutoff_of_count,
+    k_space_error,
+    pme_error,
+    pme_grid_for,
+    real_error,
+)  # fmt: skip
+from rigidmd.forces.neighbors.space import Space, cell_of
+from rigidmd.forces.parts import ChargedSites, Composition, Interactions, Settings, SystemParts
+from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
+from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
+
+ACCURACY = 1e-5  # default of forces.ewald_accuracy
+#: Largest number of k-vectors along an edge, as for forces.ewald_k_max: more would take all memory.
+MOST_K_VECTORS = 1000
+MOST_K_VECTORS_IN_ALL = 2e7  # with which a step with 1000 sites takes half a minute
+#: A net charge below this fraction of the sum of |q| is rounding.
+NEUTRAL = 1e-10
+#: Largest error of the polynomials in single precision between unit charges, as a fraction of the real-space error.
+#: With it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
+FIT_ERROR_FRACTION = 0.02
+
+
+def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
+    """Messages on keys of [forces] that this box does not allow."""
+    if space.volume == inf:
+        instead = "use reaction_field, which without a box is Coulomb's law"
+        return [f"forces.electrostatics = {forces.electrostatics!r} needs a periodic box; {instead}"]
+    return screening_errors("ewald_alpha_per_A", forces.ewald_alpha_per_A, cutoff)
+
+
+def settings(forces: Any, composition: Composition, cutoff: float) -> Settings:
+    """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of them are set."""
+    usual = "plain" if forces.truncation == "plain" else "shift"
+    numbers: dict[str, Any] = {"ewald_truncation": forces.ewald_truncation or usual}
+    charges, cell = composition.charges, cell_of(composition.space)
+    if charges.count == 0:
+        return Settings(numbers, [])
+    accuracy = forces.ewald_accuracy or ACCURACY
+    part = accuracy / sqrt(2)  # of the real-space and of the reciprocal error
+    unreachable = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
+    alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part))
+    if alpha * cutoff > MAX_ALPHA_CUTOFF:
+        return Settings(numbers, [f"{unreachable} with a cutoff of {cutoff:g} Å; use a longer one"])
+    numbers |= {"ewald_alpha_per_A": alpha, "ewald_accuracy": None}
+    longest = np.linalg.norm(cell, axis=1).max()
+    if forces.electrostatics == "ewald":
+        radius = forces.ewald_k_radius_per_A
+        if not forces.sets_k_vectors:
+            radius = float(k_cutoff_for(charges, alpha, 2 * pi * np.linalg.inv(cell).T, part))
+        if radius is not None and forces.ewald_k_max is None and radius * longest > 2 * pi * MOST_K_VECTORS:
+            given = f"forces.ewald_k_radius_per_A = {radius:g}{_default(forces.ewald_k_radius_per_A)}"
+            return Settings(numbers, [f"{given} is more than {MOST_K_VECTORS} k-vectors along an edge of the box"])
+        if (count := _number_of_k_vectors(forces, radius, composition.space.volume)) > MOST_K_VECTORS_IN_ALL:
+            fault = f"needs about {count:.2g} k-vectors, more than {MOST_K_VECTORS_IN_ALL:.2g}"
+            advice = "use pme, a lower accuracy, fewer k-vectors or a smaller box"
+            return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
+        return Settings(numbers | {"ewald_k_radius_per_A": radius}, [])
+    grid, order = forces.pme_grid, forces.pme_order
+    has_given_cell = np.array_equal(composition.basis, k_vectors.SAME_BASIS)
+    if grid is not None and len(set(grid)) > 1 and not has_given_cell:
+        fault = (
+            f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the "
+            f"equivalent cell with {composition.cell}. Give this cell as the box, or three equal numbers, or leave "
+            "pme_grid out"
+        )
+        return Settings(numbers, [fault])
+    if grid is None and longest > MAX_GRID_POINTS * SPACINGS[0]:
+        fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
+        return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
+    if grid is None or order is None:
+        found = pme_grid_for(charges, alpha, cell, part, order, grid)
+        if found is None:
+            given = " with the given forces.pme_order or pme_grid" if order or grid else ""
+            fault = f"{unreachable}{given} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or a longer cutoff"
+            return Settings(numbers, [fault])
+        grid, order = found
+    numbers["pme_order"] = order
+    if has_given_cell or forces.pme_grid is not None:
+        numbers["pme_grid"] = grid
+    else:
+        numbers["ewald_accuracy"] = accuracy
+    return Settings(numbers, [], grid)
+
+
+def _default(given: object) -> str:
+    return "" if given else " (the default)"
+
+
+def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> float:
+    """Approximate number of k-vectors within a radius (1/Å) and the limits of [forces]."""
+    most = forces.ewald_k_max
+    boxed = inf if most is None else prod(2.0 * n + 1 for n in (most if isinstance(most, tuple) else (most,) * 3))
+    return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
+
+
+class _Errors(NamedTuple):
+    """Truncation errors and k-vectors of an Ewald sum."""
+
+    real: float  # e²/Å², see `ewald.errors`
+    k_space: float
+    vectors: k_vectors.KVectors | None  # with PME only for the interactions of frozen molecules
+
+
+def _errors(parts: SystemParts) -> _Errors:
+    """Truncation errors and k-vectors of a resolved scene."""
+    forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
+    charges = charges_in(parts.species, np.bincount(parts.model.species, minlength=len(parts.species)))
+    alpha = forces.ewald_alpha_per_A
+    of_real_space = real_error(charges, alpha, forces.cutoff_A, volume)
+    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    if parts.grid is not None:
+        of_k_space, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
+        if not parts.moves[parts.model.species].all():
+            radius = k_cutoff_for(charges, alpha, reciprocal, 1e-3 * of_k_space)
+            vectors = k_vectors.k_vectors_within(reciprocal, radius)
+        return _Errors(of_real_space, of_k_space, vectors)
+    most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
+    if isinstance(most, int):
+        most = (most, most, most)
+    if radius is None:
+        vectors = k_vectors.k_vectors_up_to(most, forces.ewald_k2_max, parts.basis)
+    else:
+        vectors = k_vectors.k_vectors_within(reciprocal, radius, most, parts.basis)
+    if vectors.total == 0:
+        raise SceneError(parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"])
+    beyond = k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume)
+    return _Errors(of_real_space, beyond, vectors)
+
+
+def interactions(parts: SystemParts) -> Interactions:
+    """The charges of a scene with an Ewald sum. Raises SceneError."""
+    scene, forces, charged, found = parts.scene, parts.scene.forces, parts.charged, _errors(parts)
+    alpha, cutoff = forces.ewald_alpha_per_A, forces.cutoff_A
+    charge = charged.charge_e * COULOMB_CHARGE
+    shifted = forces.ewald_truncation == "shift"
+    potential = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * found.real)
+    if parts.grid is None:
+        vectors = found.vectors
+        assert vectors is not None  # it has k-vectors without a grid
+        reciprocal = direct_sum.EwaldSum(alpha, charge, charged.sites, vectors)
+        how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
+        if forces.ewald_k_max is not None and not np.array_equal(parts.basis, k_vectors.SAME_BASIS):
+            how += "; they are the k-vectors that ewald_k_max means in the given cell"
+    else:
+        from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
+
+        reciprocal = Pme(alpha, charge, charged.sites, parts.grid, forces.pme_order)
+        how = f"grid {' x '.join(map(str, parts.grid))}, splines of order {forces.pme_order}"
+    terms = {"coulomb_real": parts.pair_forces(potential, charged.sites), "coulomb_reciprocal": reciprocal}
+    constants = {
+        # The shift applies to all charges within the cutoff of a charge, which together are nearly neutral, including
+        # the charge itself and its molecule. The pair loop leaves these out; this constant adds them.
+        "coulomb_self": charged.sum_over_molecules(
+            lambda q, x: corrections.self_energy(q, alpha) - 0.5 * potential.shift * float(q.sum()) ** 2
+        ),
+        "coulomb_intramolecular": charged.sum_over_molecules(
+            lambda q, x: corrections.intramolecular_energy(q, x, alpha)
+        ),
+    }
+    error = float(np.hypot(found.real, found.k_space))
+    notes = [
+        f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cutoff {cutoff:g} Å, {how}"
+        + ("" if potential.shift == 0 else "; energies of real space shifted to 0 at the cutoff"),
+        f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
+        f"kJ/(mol Å); {found.real:.2g} beyond the cutoff, {found.k_space:.2g} in the reciprocal part",
+    ]
+    frozen_sites = ~parts.moves[parts.model.species][charged.sites.molecule]
+    net, net_frozen = charge.sum(), charge[frozen_sites].sum()
+    neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
+    if not neutral:
+        terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
+        notes.append(
+            f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
+            "makes it neutral, and energies and pressure depend on the size of the box"
+        )
+    if (permittivity := forces.ewald_surface_permittivity) < inf:
+        if not neutral:
+            why = "the dipole of a box with a net charge is not defined; leave it out"
+            raise SceneError(scene.source, [f"forces.ewald_surface_permittivity: {why}"])
+        terms["coulomb_surface"] = corrections.surface_dipole(charge, permittivity, charged.sites)
+    pressure = 0.0
+    if frozen_sites.any():
+        assert found.vectors is not None  # it has k-vectors with frozen molecules
+        constants["coulomb_frozen"], pressure = _frozen_correction(charged, charge * frozen_sites, found.vectors)
+    return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
+
+
+def _frozen_correction(charged: ChargedSites, charge: np.ndarray, vectors: k_vectors.KVectors) -> tuple[float, float]:
+    """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
+    (s,) is 0 for sites that move."""
+    sites, parts = charged.sites, charged.parts
+    state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
+    arms = np.zeros((len(charge), 3))
+    if len(state.rotation):
+        arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
+    position = state.position[sites.molecule] + arms
+    energy, force, virial = direct_sum.ewald_sum_in_numpy(
+        charge, position, cell_of(parts.space), forces.ewald_alpha_per_A, vectors
+    )
+    dipole = charge @ position
+    surface = 2 * pi / ((2 * forces.ewald_surface_permittivity + 1) * volume)
+    force -= 2 * surface * charge[:, None] * dipole
+    energy += surface * float(dipole @ dipole)
+    trace = float(virial.trace()) + 3 * surface * float(dipole @ dipole)
+    trace -= 2 * surface * float(dipole @ dipole) + float((force * arms).sum())
+    return -energy, -trace / (3 * volume)

@@ -1,0 +1,163 @@
+"""What force terms are made of: the parts of a system, and the interactions that are made from them.
+
+A factory of this package makes the terms of one key of a scene: `interactions` of a pair potential or of a method of
+electrostatics, `term` of a field. The scene and its molecules are values of `scene`, a package above this one, so that
+their types are given in words.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.core.state import State
+from rigidmd.forces.ewald.errors import Charges, charges_in
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, exclusion_groups, sites_of
+from rigidmd.forces.neighbors.space import Space
+from rigidmd.units import COULOMB_CHARGE
+
+Grid = tuple[int, int, int]
+
+
+class SystemParts(NamedTuple):
+    """The parts of a system on which its terms depend."""
+
+    scene: Any  # `scene.MolecularScene`, with defaults
+    species: list[Any]  # `scene.models.Molecule`
+    model: Any  # `dynamics.model.Model`
+    space: Space
+    state: State  # the start
+    number: np.ndarray  # (n,) residue numbers, by which a scene selects molecules
+    basis: np.ndarray  # (3, 3) integers: the edges of the box in terms of the edges of the given cell
+    grid: Grid | None  # of PME, along the edges of the box
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Whether each species (species,) moves."""
+        return self.model.inverse_mass > 0
+
+    def sites(self, indices: list[np.ndarray]) -> BodySites | CentralSites:
+        """The sites indices[k] of each species k."""
+        offsets = [m.positions_body[c] for m, c in zip(self.species, indices, strict=True)]
+        return sites_of(self.model.species, offsets, self.model.inverse_inertia)
+
+    def pair_forces(self, potential: NamedTuple, sites: BodySites | CentralSites) -> PairForces:
+        """The term of a pair potential between sites of different molecules, not both frozen."""
+        return PairForces(potential, sites, exclusion_groups(sites, ~self.moves[self.model.species]))
+
+    @property
+    def charged(self) -> "ChargedSites":
+        indices = [np.flatnonzero(m.charges != 0) for m in self.species]
+        charge = gather_per_molecule(
+            [m.charges[c] for m, c in zip(self.species, indices, strict=True)], self.model.species
+        )
+        return ChargedSites(self, indices, self.sites(indices), charge)
+
+
+class ChargedSites(NamedTuple):
+    """The charged sites of a system."""
+
+    parts: SystemParts
+    indices: list[np.ndarray]  # charged sites of each species
+    sites: BodySites | CentralSites
+    charge_e: np.ndarray  # (s,)
+
+    def sum_over_molecules(self, energy: Callable[[np.ndarray, np.ndarray], float]) -> float:
+        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""
+        total, parts = 0.0, self.parts
+        for m, c, moves, count in zip(
+            parts.species, self.indices, parts.moves, np.bincount(parts.model.species, minlength=len(parts.species)),
+            strict=True,
+        ):  # fmt: skip
+            if moves and count:
+                total += int(count) * energy(m.charges[c] * COULOMB_CHARGE, m.positions_body[c])
+        return total
+
+
+class Tail(NamedTuple):
+    """Tail correction: the energy and pressure beyond the cutoff, at any volume."""
+
+    energy_volume: float  # energy times the volume, u Å⁵/ps²
+    pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
+
+    def energy(self, volume: float) -> float:
+        """u Å²/ps²"""
+        return self.energy_volume / volume
+
+    def pressure(self, volume: float) -> float:
+        """u/(Å ps²)"""
+        return self.pressure_square / volume**2
+
+
+def sum_of_tails(tails: list[Tail]) -> Tail | None:
+    """Sum of the tail corrections, or None if there are none."""
+    return Tail(*np.sum(tails, axis=0).tolist()) if tails else None
+
+
+class Interactions(NamedTuple):
+    """The terms, constants and corrections of interactions between molecules."""
+
+    terms: dict[str, NamedTuple]
+    constants: dict[str, float]  # constant energies, u Å²/ps²
+    pressure: float = 0.0  # a constant part of the pressure, u/(Å ps²)
+    tail: Tail | None = None  # if the scene has forces.tail_correction
+    force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
+    notes: tuple[str, ...] = ()
+
+
+class Composition(NamedTuple):
+    """The properties of a system, besides its scene, on which defaults depend."""
+
+    species: list[Any]  # `scene.models.Molecule`
+    counts: np.ndarray  # (k,) molecules of each species
+    space: Space
+    basis: np.ndarray  # see `SystemParts`
+    cell: str  # the cell of the box in terms of the given cell, for messages
+
+    @property
+    def charges(self) -> Charges:
+        return charges_in(self.species, self.counts)
+
+
+class Settings(NamedTuple):
+    """Settings of a method of electrostatics that follow from the system."""
+
+    numbers: dict[str, Any]  # keys of [forces]
+    errors: list[str]
+    grid: Grid | None = None  # of PME, along the edges of the box
+
+
+def select_by_number(
+    ranges: list[tuple[int, int]], name: str, of_species: np.ndarray, number: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, str]]:
+    """For each range of molecule numbers of a species: its text, its mask (n,), and a message on missing numbers."""
+    for first, last in ranges:
+        text = f"{first}" if first == last else f"{first}-{last}"
+        mask = of_species & (first <= number) & (number <= last)
+        fault, present = "", number[of_species]
+        if not mask.any() or last > present.max():
+            there = f"they have {present.min()} to {present.max()}" if len(present) else "there are none"
+            fault = f"no {name} has the number {text}; {there}"
+        yield text, mask, fault
+
+
+def gather_per_molecule(values: list[np.ndarray], species: np.ndarray) -> np.ndarray:
+    """values[k], an array (s_k, ...) of each species k, repeated for each molecule in order; species (n,)."""
+    sizes = np.array([len(array) for array in values])
+    begin, count = np.cumsum(sizes) - sizes, sizes[species]
+    rows = np.repeat(begin[species] - np.cumsum(count) + count, count)
+    rows += np.arange(len(rows))
+    return np.concatenate(values)[rows]
+
+
+def sites_named(species: list[Any], name: str) -> list[np.ndarray]:
+    """Masks of the sites of each species with this name, or else this element; SPECIES.NAME for one species."""
+    owner, _, site = name.rpartition(".")
+    for attribute in ("site_names", "elements"):
+        found = [
+            np.array([owner in ("", m.name) and other == site for other in getattr(m, attribute)]) for m in species
+        ]
+        if any(mask.any() for mask in found):
+            break
+    return found
