@@ -339,12 +339,13 @@ def pair_law(
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
+    columns = None
     if isinstance(table, str | Path):
         columns = read_columns(Path(table))
-    elif table is not None and not (isinstance(table, tuple | list) and len(table) in (2, 3)):
-        raise ValueError("table must be a file, or two lists: distances in Å, energies in kJ/mol; a third has forces")
-    else:
-        columns = table and Columns(table[0], table[1], table[2] if len(table) > 2 else None)
+    elif table is not None:
+        if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
+            raise ValueError("table must be a file, or lists: distances in Å, energies in kJ/mol, perhaps forces")
+        columns = Columns(table[0], table[1], table[2] if len(table) > 2 else None)
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
     for parameter, rule in (mixing or {}).items():
