@@ -23,6 +23,6 @@ from rigidmd.compile.thread_pool import call_address, set_threads
 
 __all__ = [
     "BLOCKS", "MOST_BLOCKS", "SIMD_BITS", "BoundTask", "Code", "CompiledTask", "NumbaStruct", "TaskArguments", "call",
-    "call_address", "call_blocks", "chosen_by_type", "compile_together", "implements", "is_a", "kernel", "load_arguments",
-    "pack_arguments", "set_threads", "task",
+    "call_address", "call_blocks", "chosen_by_type", "compile_together", "implements", "is_a", "kernel",
+    "load_arguments", "pack_arguments", "set_threads", "task",
 ]  # fmt: skip

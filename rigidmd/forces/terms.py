@@ -7,12 +7,15 @@ what a scene has is compiled. A new force is one file with a NamedTuple and an `
 potential one with an `@implements(pair_loop.pair)`.
 """
 
+# isort: skip_file
 from typing import NamedTuple
 
 import numpy as np
 from numba import literal_unroll, types
 
-from rigidmd.compile import Code, NumbaStruct, call_address, implements, is_a, kernel, load_arguments, task
+from rigidmd.compile import (
+    Code, NumbaStruct, call_address, chosen_by_type, implements, is_a, kernel, load_arguments, task,
+)  # fmt: skip
 from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
 
 
@@ -67,13 +70,9 @@ def add_forces(term, state, load, tally):
     raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
 
 
+@chosen_by_type(inline=True)
 def worse_status(status, other):
     """The worse of two status codes; the other may be None, which is OK."""
-    raise TypeError("compiled code only")
-
-
-@implements(worse_status, inline=True)
-def _worse_status(status, other):
     if other is types.none:
         return lambda status, other: status
     return lambda status, other: max(status, other)
@@ -213,15 +212,11 @@ def has_time_dependent_terms(table: types.Type) -> bool:
     return is_a(table, TermTable) and table.types[TermTable._fields.index("rate_address")] is not types.none
 
 
+@chosen_by_type
 def compute_load(terms, state, load, which):
     """Write the forces and torques of all terms at the present positions; the worst status code. terms : a tuple of
     terms, which gives forces only, or a `TermTable`, which gets energies and virials. which : FORCES_ONLY,
     WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the load that it means."""
-    raise TypeError("compiled code only")
-
-
-@implements(compute_load)
-def _compute_load(terms, state, load, which):
     if not is_a(terms, TermTable):
         return lambda terms, state, load, which: compute_body_load(terms, state, load, None)
 

@@ -23,7 +23,8 @@ import numpy as np
 from rocket_fft import c2c, c2r, r2c
 
 from rigidmd.compile import (
-    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task,
+    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments,
+    pack_arguments, task,
 )  # fmt: skip
 from rigidmd.compile.simd import load_eight, load_four, store, sum_lanes
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
@@ -250,13 +251,9 @@ def _sort_sites(arguments, block):
     first[0] = 0
 
 
+@chosen_by_type(inline=True, count_references=False)
 def load_vector(spline, array, index):
     """Numbers of an array from an index on, as a vector of four or eight, as the weights of the spline."""
-    raise TypeError("compiled code only")
-
-
-@implements(load_vector, inline=True, count_references=False)
-def _load_vector(spline, array, index):
     if is_a(spline, LowOrderSpline):
         return lambda spline, array, index: load_four(array, index)
     return lambda spline, array, index: load_eight(array, index)

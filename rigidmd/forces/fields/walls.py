@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.state import BEHIND_WALL, NOT_FINITE, OK, State
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, locate_site, sites_of
 from rigidmd.forces.neighbors.space import Orthorhombic, Unbounded

@@ -2,7 +2,8 @@
 
 A slot is a position in that order. Coordinates are stored relative to the origin of their cluster, so that float32 is
 accurate enough: 2e-7 Å for sites within reach of one another. Arrays of positions and forces hold x, y, z of a cluster
-as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`.
+as three consecutive vectors; slot k of cluster c has its x at `3 * width * c + k`. Tasks have the arguments (pairs,
+sites, state) with a `lists.PairList`, or `pairs` alone.
 """
 
 # isort: skip_file
@@ -11,13 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, kernel, load_arguments, task
 from rigidmd.compile.simd import (
     lane_count, lanes_of, largest_lane, load, load_scalar, mask_bits, square_root, store, zeros,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import index_of_x, locate_site, predict_site
 
+BUILT, LEAD_TIME = 0, 1  # columns of PairList.times
 MAX_SERIAL_SITES = 128  # in one block
+MAX_DISTANCE = 1e9  # in list radii from the origin, which are no longer than a box: 32 bits can count the boxes
 
 
 class Clusters(NamedTuple):
@@ -72,14 +75,17 @@ def _molecules_of_block(sites, blocks, block):
     return n * block // blocks, n * (block + 1) // blocks
 
 
-@kernel(count_references=False)
-def wrap_sites_of_block(clusters, cell, sites, state, lead, max_distance, block):
-    """Write positions in the brick of the sites of a block of molecules into `local`, for `bin_sites_of_block`.
+@task(count_references=False)
+def wrap_sites(arguments, block):
+    """Write positions in the brick of the sites of a block of molecules into `local`, for `bin_sites`.
 
     The brick is an orthorhombic box whose edges are the diagonal of the cell (3, 3); it tiles space like the cell. The
-    positions are predicted for a time `lead` ahead, see `predict_site`. `extent` gets their extent, or NaN if a
-    coordinate is farther from the origin than `max_distance`, or is not finite.
+    positions are predicted for the lead time of the list, see `predict_site`. `extent` gets their extent, or NaN if a
+    coordinate is farther from the origin than MAX_DISTANCE, or is not finite.
     """
+    pairs, sites, state = load_arguments(arguments)
+    clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
+    max_distance = MAX_DISTANCE * (pairs.cutoff + pairs.skin)
     extent, local = clusters.extent[block], clusters.local
     for k in range(3):
         extent[k], extent[3 + k] = inf, -inf
@@ -98,11 +104,13 @@ def wrap_sites_of_block(clusters, cell, sites, state, lead, max_distance, block)
                 extent[3 + k] = max(extent[3 + k], local[3 * i + k])
 
 
-@kernel(count_references=False)
-def bin_sites_of_block(clusters, sites, block):
+@task(count_references=False)
+def bin_sites(arguments, block):
     """Write the bins of the sites of a block of molecules, and heights within bins, into `slot` and `moved`. Bins form
     columns along z, as wide as a cluster. They run up one column and down the next, so that a cluster that begins in
     one column and ends in the next is compact too."""
+    pairs, sites, _ = load_arguments(arguments)
+    clusters = pairs.clusters
     low, extent, (nx, ny, nz) = _bins(clusters)
     local = clusters.local
     first, end = _molecules_of_block(sites, len(clusters.extent), block)
@@ -119,7 +127,7 @@ def bin_sites_of_block(clusters, sites, block):
 
 @kernel
 def sort_into_clusters(clusters):
-    """Sort sites by bin and height; `set_origins_of_block` must follow. False if the extent is not finite."""
+    """Sort sites by bin and height; `set_origins` must follow. False if the extent is not finite."""
     s = len(clusters.slot)
     _, extent, (nx, ny, nz) = _bins(clusters)
     if not extent[0] >= 0:
@@ -199,9 +207,11 @@ def _bin(x, extent, count):
     return min(count - 1, int(x / extent * count)) if extent > 0 else 0
 
 
-@kernel(count_references=False)
-def set_origins_of_block(clusters, cell, sites, state, lead, group, block):
+@task(count_references=False)
+def set_origins(arguments, block):
     """Set origins and references of newly sorted clusters; the origin is the centre of the bounding box."""
+    pairs, sites, state = load_arguments(arguments)
+    clusters, cell, lead = pairs.clusters, pairs.cell, pairs.times[LEAD_TIME]
     width = lanes_of(clusters.local)
     order, origin, reference = clusters.order, clusters.origin, clusters.reference
     for c in range(clusters.bounds[block], clusters.bounds[block + 1]):
@@ -221,7 +231,7 @@ def set_origins_of_block(clusters, cell, sites, state, lead, group, block):
             i = order[slot]
             if slot < len(clusters.slot):
                 clusters.slot[i] = slot
-            clusters.group[slot] = group[i]
+            clusters.group[slot] = pairs.group[i]
             clusters.half_square[slot] = 0.0
             for k in range(3):
                 n = slot + 2 * width * c + k * width
@@ -261,7 +271,7 @@ def _pair_up(order, at, width, first, end):
 
 @kernel(count_references=False)
 def restore_half_squares(clusters):
-    """Set `half_square` as `set_origins_of_block` does, from the references."""
+    """Set `half_square` as `set_origins` does, from the references."""
     width = lanes_of(clusters.local)
     for slot in range(len(clusters.order)):
         clusters.half_square[slot] = 0.0
@@ -269,9 +279,11 @@ def restore_half_squares(clusters):
             clusters.half_square[slot] += 0.5 * clusters.reference[n] ** 2
 
 
-@kernel(count_references=False)
-def set_local_of_block(clusters, cell, sites, state, block):
+@task(count_references=False)
+def set_local(arguments, block):
     """Set `local` of the sites of a block of molecules to the present positions; padding stays at its reference."""
+    pairs, sites, state = load_arguments(arguments)
+    clusters, cell = pairs.clusters, pairs.cell
     width = lanes_of(clusters.local)
     local, origin = clusters.local, clusters.origin
     first, end = _molecules_of_block(sites, len(clusters.extent), block)
@@ -297,9 +309,11 @@ def use_present_as_reference(clusters):
         clusters.reference[n] = clusters.local[n]
 
 
-@kernel(inline=True, count_references=False)
-def measure_displacements_of_block(clusters, limit, block):
-    """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds the limit."""
+@task(count_references=False)
+def measure_displacements(arguments, block):
+    """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds half the skin."""
+    pairs = load_arguments(arguments)
+    clusters, limit = pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0])
     width = lanes_of(clusters.local)
     local, reference = clusters.local, clusters.reference
     full = (1 << width) - 1

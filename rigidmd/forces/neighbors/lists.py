@@ -26,7 +26,7 @@ from rigidmd.compile import kernel
 from rigidmd.compile.simd import lane_count, zeros
 from rigidmd.core.state import CELL_CHANGED
 from rigidmd.errors import SimulationError
-from rigidmd.forces.neighbors.clusters import Clusters, clusters_of, order_of
+from rigidmd.forces.neighbors.clusters import BUILT, Clusters, clusters_of, order_of
 from rigidmd.forces.neighbors.tree import BoxTree, empty_tree
 
 IMAGE_BITS = 6
@@ -41,7 +41,6 @@ ROUNDING = 1e-5  # relative; float32 distances are accurate to 1e-6
 # Columns of PairList.needed and PairList.counters. WINDOW: number of clusters behind the block that its rows reach.
 ENTRIES, MASKED, NEIGHBORS, WINDOW, NEIGHBORS_OF_ONE = 0, 1, 2, 3, 4
 USABLE, BUILDS, STATUS, IMAGES_FOUND = 0, 1, 2, 3
-BUILT, LEAD_TIME = 0, 1  # of PairList.times
 
 
 class PairList(NamedTuple):

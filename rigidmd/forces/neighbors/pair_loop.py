@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from rigidmd.compile import Code, call, call_blocks, implements, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import (
+    Code, call, call_blocks, chosen_by_type, implements, kernel, load_arguments, pack_arguments, task,
+)  # fmt: skip
 from rigidmd.compile.simd import (
     add_lane_sums, align_stack, broadcast, convert_to, extract_lane, lane_count, lanes_of, load, load_broadcast,
     load_four, load_scalar, mask_from_bits, select, store, sum_lanes, to_double, zeros,
@@ -159,16 +161,20 @@ def pair(potential, i, j, r2):
     raise TypeError(f"{type(potential).__name__} is not a pair potential, or this was called outside compiled code")
 
 
+@chosen_by_type
 def arrange(potential, slot_potential, order):
-    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in each slot."""
-    raise TypeError("compiled code only")
+    """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in each slot. Potentials
+    with other numbers of sites than a charge implement it."""
+    if "charge" in slot_potential.fields:
 
+        def arrange_charges(potential, slot_potential, order):
+            for slot, i in enumerate(order):
+                slot_potential.charge[slot] = potential.charge[i]
 
-@kernel
-def into_slots(of_sites, in_slots, order):
-    """Copy numbers of the sites (s,) into slots (slots,); `order` has the site in each slot."""
-    for slot, i in enumerate(order):
-        in_slots[slot] = of_sites[i]
+        return arrange_charges
+    if any(isinstance(of, types.Array) for of in slot_potential.types):
+        return None
+    return lambda potential, slot_potential, order: None
 
 
 @implements(terms.add_forces, PairWorkspace, count_references=False)
@@ -196,13 +202,9 @@ def _add_pair_forces(term, state, load, tally):
     return OK
 
 
+@chosen_by_type
 def _call_tallied(with_energies, code, arguments, blocks):
     """Call the task that also computes virials, and energies if they are needed."""
-    raise TypeError("compiled code only")
-
-
-@implements(_call_tallied)
-def _call_with_energies(with_energies, code, arguments, blocks):
     if with_energies is types.none:
         return lambda with_energies, code, arguments, blocks: call_blocks(
             code, "forces_and_energies", arguments, blocks
@@ -391,14 +393,10 @@ def _displacements(pairs, c, here, neighbors, origin_vector, number):
     return other, image, (_separation(here[0], x, y, z), _separation(here[1], x, y, z))
 
 
+@chosen_by_type(inline=True)
 def load_origin_vector(pairs, c, neighbors, origin_vector, number):
     """Vector from the origin of a neighbour to the origin of cluster c, Å. In single precision it is stored: to compute
     it would take a sixth of the time of all pairs."""
-    raise TypeError("compiled code only")
-
-
-@implements(load_origin_vector, inline=True)
-def _load_origin_vector(pairs, c, neighbors, origin_vector, number):
     if origin_vector.dtype.bitwidth == 32:
 
         def stored(pairs, c, neighbors, origin_vector, number):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import kernel
+from rigidmd.compile import kernel, load_arguments, task
 from rigidmd.compile.simd import (
     broadcast, lanes_of, load, load_broadcast, load_scalar, load_with_lanes_of, mask_bits, maximum, minimum,
     pairwise_minimum, square_root, store_even_lanes,
@@ -320,9 +320,10 @@ def _mask_of_lanes(pairs, i, candidate, radius2):
     return meets if mask_bits(dx * dx + dy * dy + dz * dz <= radius2) & meets else 0
 
 
-@kernel(count_references=False)
-def update_origin_vectors_of_block(pairs, block):
+@task(count_references=False)
+def update_origin_vectors(arguments, block):
     """Recompute the vectors between origins of a block, for the images that have moved."""
+    pairs = load_arguments(arguments)
     origin_vector = pairs.origin_vector[block]
     if len(origin_vector) == 0:
         return

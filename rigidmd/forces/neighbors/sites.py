@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 
 from rigidmd.compile import (
-    BLOCKS, MOST_BLOCKS, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task,
+    BLOCKS, MOST_BLOCKS, call_blocks, chosen_by_type, is_a, kernel, load_arguments, pack_arguments, task,
 )  # fmt: skip
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import EXAMPLE
@@ -109,13 +109,9 @@ def index_of_x(slot, width):
     return 3 * slot - 2 * (slot & (width - 1))
 
 
+@chosen_by_type(inline=True)
 def site_vector(vectors, i):
     """(x, y, z) of site i in an array (s, 3) or `InSlots`."""
-    raise TypeError("compiled code only")
-
-
-@implements(site_vector, inline=True)
-def _site_vector(vectors, i):
     if isinstance(vectors, types.Array):
         return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
 
@@ -194,13 +190,9 @@ def site_offset_lab(sites, state, m, i):
     )
 
 
+@chosen_by_type(inline=True)
 def load_molecule(sites, state, load, m, site_force):
     """Add the site forces of molecule m, and their torque about the centre of mass, to its load."""
-    raise TypeError("compiled code only")
-
-
-@implements(load_molecule, inline=True)
-def _load_molecule(sites, state, load, m, site_force):
     if is_a(sites, CentralSites):
 
         def load_central(sites, state, load, m, site_force):
@@ -301,16 +293,12 @@ def virial_buffer() -> np.ndarray:
     return np.zeros((MOST_BLOCKS, 16))
 
 
+@chosen_by_type
 def to_molecular_virial(sites, code, state, site_force, virial, tally):
     """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
 
     code : with the task "offset_virial". virial : of `virial_buffer`
     """
-    raise TypeError("compiled code only")
-
-
-@implements(to_molecular_virial)
-def _virial_of_molecules(sites, code, state, site_force, virial, tally):
     if is_a(sites, CentralSites):
         return lambda sites, code, state, site_force, virial, tally: None
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import kernel
+from rigidmd.compile import kernel, load_arguments, task
 from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bits, maximum
 
 
@@ -32,8 +32,10 @@ def empty_tree(count: int) -> BoxTree:
     return BoxTree(np.full(nodes, inf), np.full(nodes, -inf), np.array(level))
 
 
-@kernel(count_references=False)
-def fit_boxes(tree, clusters):
+@task(count_references=False)
+def fit_boxes(arguments, block):
+    pairs = load_arguments(arguments)
+    tree, clusters = pairs.tree, pairs.clusters
     arity = lanes_of(tree.low)
     width = lanes_of(clusters.local)
     tree.low[:] = inf

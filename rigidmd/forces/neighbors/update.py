@@ -6,14 +6,14 @@ from math import ceil, floor, inf, sqrt
 from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pack_arguments, task
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
-    bin_sites_of_block, measure_displacements_of_block, restore_half_squares, set_local_of_block, set_origins_of_block,
-    sort_into_clusters, use_present_as_reference, wrap_sites_of_block,
+    BUILT, LEAD_TIME, bin_sites, measure_displacements, restore_half_squares, set_local, set_origins,
+    sort_into_clusters, use_present_as_reference, wrap_sites,
 )  # fmt: skip
 from rigidmd.forces.neighbors.lists import (
-    BUILDS, BUILT, ENTRIES, IMAGES_FOUND, LEAD_TIME, LONGEST_SKIN, MASKED, MAX_NEIGHBORS, NEIGHBORS, NEIGHBORS_OF_ONE,
-    STATUS, USABLE, PairList, largest_displacement, most_needed,
+    BUILDS, ENTRIES, IMAGES_FOUND, LONGEST_SKIN, MASKED, MAX_NEIGHBORS, NEIGHBORS, NEIGHBORS_OF_ONE, STATUS, USABLE,
+    PairList, largest_displacement, most_needed,
 )  # fmt: skip
-from rigidmd.forces.neighbors.rows import fill_block, update_origin_vectors_of_block
+from rigidmd.forces.neighbors.rows import fill_block, update_origin_vectors
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
@@ -22,17 +22,16 @@ from rigidmd.forces.neighbors.tree import fit_boxes
 #: these. The list is valid for longer by a fifth (water) or a half (nitrogen). With a larger fraction the sites are
 #: farther from the predictions on average, and the loop has to work through more shells.
 LEAD_FRACTION = 0.25
-MAX_DISTANCE = 1e9  # in list radii from the origin, which are no longer than a box: 32 bits can count the boxes
 
 
 def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
     """The machine code of the tasks that update a list."""
     site_arguments = (pairs, sites, EXAMPLE[0])
     return Code(
-        origin_vectors=(_update_origin_vectors, pairs), local=(_set_local, site_arguments),
-        displacements=(_measure_displacements, pairs), wrap=(_wrap_sites, site_arguments),
-        bin=(_bin_sites, site_arguments), sort=(_sort_sites, pairs), origins=(_set_origins, site_arguments),
-        boxes=(_fit_boxes, pairs), fill=(_fill, pairs),
+        origin_vectors=(update_origin_vectors, pairs), local=(set_local, site_arguments),
+        displacements=(measure_displacements, pairs), wrap=(wrap_sites, site_arguments),
+        bin=(bin_sites, site_arguments), sort=(_sort_sites, pairs), origins=(set_origins, site_arguments),
+        boxes=(fit_boxes, pairs), fill=(_fill, pairs),
     )  # fmt: skip
 
 
@@ -144,7 +143,7 @@ def _max_slack(pairs):
 
 @kernel
 def _move_images(pairs):
-    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors_of_block` must follow."""
+    """Move the images with the cell. Whether the list is still valid; `update_origin_vectors` must follow."""
     farthest2 = 0.0
     for n in range(pairs.counters[IMAGES_FOUND]):
         moved2 = 0.0
@@ -165,37 +164,6 @@ def _displacement(cell, multiple, k):
         if multiple[vector] != 0:
             total += multiple[vector] * cell[vector, k]
     return total
-
-
-@task(count_references=False)
-def _update_origin_vectors(arguments, block):
-    pairs = load_arguments(arguments)
-    update_origin_vectors_of_block(pairs, block)
-
-
-@task(count_references=False)
-def _set_local(arguments, block):
-    pairs, sites, state = load_arguments(arguments)
-    set_local_of_block(pairs.clusters, pairs.cell, sites, state, block)
-
-
-@task(count_references=False)
-def _measure_displacements(arguments, block):
-    pairs = load_arguments(arguments)
-    measure_displacements_of_block(pairs.clusters, 0.5 * (pairs.skin - pairs.slack[0]), block)
-
-
-@task(count_references=False)
-def _wrap_sites(arguments, block):
-    pairs, sites, state = load_arguments(arguments)
-    lost = MAX_DISTANCE * (pairs.cutoff + pairs.skin)
-    wrap_sites_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], lost, block)
-
-
-@task(count_references=False)
-def _bin_sites(arguments, block):
-    pairs, sites, _ = load_arguments(arguments)
-    bin_sites_of_block(pairs.clusters, sites, block)
 
 
 @task()
@@ -244,18 +212,6 @@ def _images_along(cell, k, offset, radius):
     if edge == inf:
         return 0, 0
     return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
-
-
-@task(count_references=False)
-def _set_origins(arguments, block):
-    pairs, sites, state = load_arguments(arguments)
-    set_origins_of_block(pairs.clusters, pairs.cell, sites, state, pairs.times[LEAD_TIME], pairs.group, block)
-
-
-@task(count_references=False)
-def _fit_boxes(arguments, block):
-    pairs = load_arguments(arguments)
-    fit_boxes(pairs.tree, pairs.clusters)
 
 
 @task()

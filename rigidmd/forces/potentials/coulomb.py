@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, implements, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.parts import Interactions, SystemParts
@@ -99,13 +99,6 @@ def _pair(potential, i, j, r2):
     qq = potential.charge[i] * load(potential.charge, j)
     u, w = radial(potential, r2)
     return qq * u, qq * w
-
-
-@implements(pairs.arrange)
-def _arrange(potential, slot_potential, order):
-    if not is_a(potential, ReactionField):
-        return None
-    return lambda potential, slot_potential, order: pairs.into_slots(potential.charge, slot_potential.charge, order)
 
 
 def self_energy(potential: ReactionField, position: np.ndarray) -> float:

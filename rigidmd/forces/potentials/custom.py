@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import quad
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import chosen_by_type, implements, is_a
 from rigidmd.compile.simd import evaluate_cubic, inverse, inverse_square_root, load, select, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.potentials.truncation import (
@@ -100,13 +100,9 @@ def _pair(potential, i, j, r2):
     return names_in["pair"]
 
 
+@chosen_by_type(inline=True)
 def energy_and_force(potential, formula, terms, r2):
     """(energy, force/r) of a potential with the parameters and the truncation terms of a pair."""
-    raise TypeError("compiled code only")
-
-
-@implements(energy_and_force, inline=True)
-def _energy_and_force(potential, formula, terms, r2):
     truncation = potential.types[potential.fields.index("truncation")]
     if uses_root(formula, truncation):
 
@@ -126,10 +122,8 @@ def _energy_and_force(potential, formula, terms, r2):
 
 @implements(pairs.arrange)
 def _arrange(potential, slot_potential, order):
-    if not is_a(potential, CustomPotential):
+    if not is_a(slot_potential, CustomManyKinds):
         return None
-    if is_a(slot_potential, CustomOneKind):
-        return lambda potential, slot_potential, order: None
 
     def arrange(potential, slot_potential, order):
         slots = len(order)

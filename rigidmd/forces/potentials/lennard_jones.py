@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.integrate import quad
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, zeros
 from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors import pair_loop as pairs
@@ -186,13 +186,9 @@ def _pair(potential, i, j, r2):
     return pair
 
 
+@chosen_by_type(inline=True)
 def energy_and_force(potential, c12, c6, r2):
     """(energy, force/r) of sites with c12/r¹² - c6/r⁶ at squared distances r2."""
-    raise TypeError("compiled code only")
-
-
-@implements(energy_and_force, inline=True)
-def _energy_and_force(potential, c12, c6, r2):
     if is_a(potential, LennardJonesManyKinds):
 
         def of_many(potential, c12, c6, r2):
@@ -251,10 +247,8 @@ def mixed(terms12, terms6, c12, c6):
 
 @implements(pairs.arrange)
 def _arrange(potential, slot_potential, order):
-    if not is_a(potential, LennardJones):
+    if not is_a(slot_potential, LennardJonesManyKinds):
         return None
-    if is_a(slot_potential, LennardJonesOneKind):
-        return lambda potential, slot_potential, order: None
 
     def arrange(potential, slot_potential, order):
         for slot, i in enumerate(order):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erfc, ive
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import (
     HAS_AVX512, inverse_root_and_cube, inverse_square_root, load, permute_two, polynomial, split_integer_part, zeros,
 )  # fmt: skip
@@ -269,13 +269,6 @@ def _pair(potential, i, j, r2):
         return qq * (u + potential.slope * (r2 * inverse) + potential.shift), qq * (w - potential.slope * inverse)
 
     return shifted_pair
-
-
-@implements(pairs.arrange)
-def _arrange(potential, slot_potential, order):
-    if not (is_a(potential, ScreenedCoulomb) or is_a(potential, DampedShiftedForce)):
-        return None
-    return lambda potential, slot_potential, order: pairs.into_slots(potential.charge, slot_potential.charge, order)
 
 
 def damped_self_energy(potential: DampedShiftedForce, position: np.ndarray) -> float:

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_square_root, maximum, polynomial
 
 TruncationName = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
@@ -205,20 +205,16 @@ def switch_coordinate(truncation, r):
     return maximum((r - truncation.start) * (1 / (truncation.cutoff - truncation.start)), 0.0)
 
 
-def truncated(truncation, terms, switched, r2, inverse, u, w):
-    """(energy, force/r) with the truncation, from u, w without it at squared distances r2; scalars or vectors. u
-    already includes the constant of `terms`. inverse : 1/r, if `needs_root`. switched : the switch term or correction
-    that w already includes; without one, a switch multiplies the energy here, for any potential"""
-    raise TypeError("compiled code only")
-
-
 def needs_root(truncation, switched) -> bool:
     """Whether a truncated force needs 1/r, by the Numba types."""
     return not is_a(truncation, Unmodified) and not is_a(switched, SwitchCorrection)
 
 
-@implements(truncated, inline=True)
-def _truncated(truncation, terms, switched, r2, inverse, u, w):
+@chosen_by_type(inline=True)
+def truncated(truncation, terms, switched, r2, inverse, u, w):
+    """(energy, force/r) with the truncation, from u, w without it at squared distances r2; scalars or vectors. u
+    already includes the constant of `terms`. inverse : 1/r, if `needs_root`. switched : the switch term or correction
+    that w already includes; without one, a switch multiplies the energy here, for any potential"""
     if is_a(truncation, Unmodified):
         return lambda truncation, terms, switched, r2, inverse, u, w: (u, w)
     if is_a(truncation, ForceShifted):
