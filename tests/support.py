@@ -9,10 +9,12 @@ test_support.py checks that no test file goes past this door but those it lists 
 """
 
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import zlib
 from importlib import import_module
 from pathlib import Path
 
@@ -113,6 +115,44 @@ def rigidmd_command(*arguments, **options) -> subprocess.CompletedProcess:
         text=True,
         **options,
     )
+
+
+#: Loads modules of rigidmd from other files, in a process that has not imported rigidmd.
+OTHER_MODULES = """
+import importlib.util, sys
+class Other:
+    modules = {modules!r}
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return importlib.util.spec_from_file_location(name, cls.modules[name]) if name in cls.modules else None
+sys.meta_path.insert(0, Other)
+sys.path.insert(0, {tests!r})
+"""
+
+
+def run_with_files(folder: Path, files: dict[str, str], script: str) -> str:
+    """What a script prints in a process in which the package has these files, new ones or others of the same name.
+    Classes of terms are named by the text, because compiled code is found by their names."""
+    found = {}
+    for k, (name, text) in enumerate(files.items()):
+        for term in re.findall(r"^class (\w+)\(NamedTuple\)", "" if (ROOT / "rigidmd" / name).exists() else text, re.M):
+            text = re.sub(rf"\b{term}\b", f"{term}_{zlib.crc32(text.encode()):x}", text)
+        path = folder / f"{k}_{Path(name).name}"
+        path.write_text(text)
+        found["rigidmd." + name.removesuffix(".py").replace("/", ".")] = str(path)
+    prelude = OTHER_MODULES.format(modules=found, tests=str(ROOT / "tests"))
+    done = subprocess.run([sys.executable, "-c", prelude + script], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def edited(name: str, *changes: tuple[str, str]) -> str:
+    """The text of a file of the package with some changes; each old text must be there once."""
+    text = (ROOT / "rigidmd" / name).read_text()
+    for old, new in changes:
+        assert text.count(old) == 1, f"{name}: {old!r} is there {text.count(old)} times"
+        text = text.replace(old, new)
+    return text
 
 
 def gmx(folder: Path, *arguments, text: str = "") -> str:
@@ -267,6 +307,7 @@ HOMES = {
     "dynamics.observables": "largest_values sums_of_state",
     "engines.cpu.engine": "BehindWallError DTYPES",
     "engines.ode.engine": "OdeEngine",
+    "engines.protocol": "NotFiniteError",
     "forces.body.applied": "SteadyForce",
     "forces.potentials.coulomb": "radial reaction_field",
     "forces.potentials.truncation": "SWITCH_FUNCTIONS SwitchCorrection SwitchTerm TRUNCATIONS Unmodified truncation_terms",
@@ -274,10 +315,10 @@ HOMES = {
     "forces.potentials.lennard_jones": "lennard_jones",
     "forces.potentials.custom": "CustomOneKind tail_of_pair",
     "forces.potentials.screened_coulomb": "INTERVALS TABLE_ERROR TabledScreening force_table screened screening screening_of_lanes",
-    "forces.neighbors.clusters": "clusters_of",
+    "forces.neighbors.clusters": "BUILT LEAD_TIME clusters_of",
     "analysis.pair_histogram": "count_pairs heights",
     "forces.neighbors.lists": (
-        "LEAD_TIME BUILDS BUILT ENTRIES IMAGES_FOUND MASKED NEIGHBORS NEIGHBORS_OF_ONE MAX_NEIGHBORS USABLE WINDOW end_of_row largest_displacement"
+        "BUILDS ENTRIES IMAGES_FOUND MASKED NEIGHBORS NEIGHBORS_OF_ONE MAX_NEIGHBORS USABLE WINDOW end_of_row largest_displacement"
     ),
     "forces.neighbors.pair_loop": "PairWorkspace pair_forces",
     "forces.neighbors.sites": "CentralSites blocks_of predict_site compute_site_positions",

@@ -1,5 +1,6 @@
 """What acts on molecules from outside: electric fields, gravity, walls, restraints; and what then keeps its momentum."""
 
+import json
 from math import inf, pi, sqrt
 
 import numpy as np
@@ -12,12 +13,14 @@ from support import (
     build,
     describe,
     draw_momenta,
+    edited,
     from_vector,
     molecular_trial_system,
     move,
     observe,
     random_rotations,
     remove_momentum,
+    run_with_files,
     small_scene,
 )
 
@@ -528,3 +531,109 @@ def test_a_resolved_scene_with_fields_runs_again_to_the_same_bits(tmp_path):
     first = Simulation(scene, tmp_path / "a").run()
     again = Simulation(type(scene).read(tmp_path / "a" / "scene.toml")).run()
     assert all(np.array_equal(a, b) for a, b in zip(first.state, again.state, strict=True))
+
+
+# --- a new field takes two files -------------------------------------------------------------------------------------
+
+TRAP = """
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements
+from rigidmd.core.state import OK
+from rigidmd.forces.terms import add_forces
+from rigidmd.units import KJ_PER_MOL
+
+
+class Trap(NamedTuple):
+    stiffness: float  # u/ps²
+
+    tied_to_places = True
+    changes_momentum = np.ones(3, bool)
+
+
+def term(parts, trap, where, faults):
+    if not parts.moves.all():
+        faults.append(f"{where}: it has no frozen molecules")
+    return Trap(trap.stiffness_kJ_mol_A2 * KJ_PER_MOL)
+
+
+@implements(add_forces, Trap)
+def _add_trap(term, state, load, tally):
+    for m in range(len(state.position)):
+        for k in range(3):
+            load.force[m, k] -= term.stiffness * state.position[m, k]
+            if tally is not None:
+                tally[0] += 0.5 * term.stiffness * state.position[m, k] ** 2
+    return OK
+"""
+TRAP_KEYS = """class Trap(Section):
+    \"\"\"A harmonic trap of all molecules.\"\"\"
+
+    stiffness_kJ_mol_A2: Positive
+    \"\"\"Stiffness\"\"\"
+
+
+class Fields(Section):
+    \"\"\"External fields that act on molecules.\"\"\"
+
+    trap: Trap | None = None
+    \"\"\"A harmonic trap\"\"\"
+"""
+TRAP_ENTRY = """FIELDS = {
+    "trap": FieldKind("trap", "trap", "trap", lambda trap, term: f"{trap.stiffness_kJ_mol_A2:g} kJ/mol/Å²"),
+"""
+TRAP_SCRIPT = """
+import json
+import numpy as np
+from support import Scene, build, describe, shaken
+from rigidmd.errors import SceneError
+from rigidmd.scene import schema
+
+def scene(fields, **more):
+    return Scene.from_dict({
+        "box": {"lengths_A": 20, "periodic": False}, "molecules": [{"model": "nitrogen", "count": 4} | more],
+        "start": {"temperature_K": 100}, "stages": [{"duration_ps": 0.01}], "fields": fields,
+    })
+
+def messages(*given, **more):
+    try:
+        build(scene(*given, **more))
+    except SceneError as error:
+        return error.errors
+
+trapped = scene({"trap": {"stiffness_kJ_mol_A2": 0.5}})
+system, engine, state = shaken(build(trapped), 3)
+with_trap, tallies = engine.evaluate(state)
+energy, total = tallies["trap"].energy, with_trap.force.sum(axis=0)
+print(json.dumps({
+    "energy": energy, "expected": 25 * float((state.position**2).sum()),
+    "force": total.tolist(), "sum": (-50 * state.position.sum(axis=0)).tolist(),
+    "check": describe(trapped), "without": describe(scene({})), "schema": schema()["$defs"]["Trap"]["description"],
+    "errors": [messages({"trap": {"stiffness_kJ_mol_A2": -1.0}}), messages({"trap": {"stiffness": 1.0}}),
+               messages({"trap": {"stiffness_kJ_mol_A2": 1.0}}, frozen="1")],
+}))
+"""
+
+
+def test_adding_a_field_takes_two_files(tmp_path):
+    files = {
+        "scene/fields.py": edited(
+            "scene/fields.py",
+            ('class Fields(Section):\n    """External fields that act on molecules."""\n', TRAP_KEYS),
+            ("FIELDS = {\n", TRAP_ENTRY),
+        ),
+        "forces/fields/trap.py": TRAP,
+    }
+    assert len(files) == 2
+    found = json.loads(run_with_files(tmp_path, files, TRAP_SCRIPT))
+    assert found["energy"] == pytest.approx(found["expected"])
+    assert found["force"] == pytest.approx(found["sum"])
+    assert "  trap: 0.5 kJ/mol/Å²\n" in found["check"]
+    assert "\n  trap, electric field, gravity, walls, restraints: not in [fields]" in found["without"]
+    assert found["schema"] == "A harmonic trap of all molecules."
+    (negative,), (unknown, missing), (frozen,) = found["errors"]
+    assert negative == "fields.trap.stiffness_kJ_mol_A2: is -1.0, must be greater than 0"
+    assert "did you mean stiffness_kJ_mol_A2?" in unknown + missing
+    assert frozen == "fields.trap: it has no frozen molecules"

@@ -32,6 +32,8 @@ from support import (
     formulas,
     kernel,
     lanes,
+    same_after_stops,
+    shaken,
     small_scene,
     tail_of_pair,
     truncation_terms,
@@ -432,6 +434,129 @@ def test_parameters_may_come_from_the_model():
     assert "wall: k/r**9, 10 sites, cutoff 9 Å, switch" in describe(scene)
 
 
+# --- tables in files -------------------------------------------------------------------------------------------------
+
+ARGON = {"sigma": 3.405, "epsilon": 0.996}  # of the shipped model, Å and kJ/mol
+
+
+def argon_energy(r):
+    """Energy (kJ/mol) and force (kJ/mol/Å) of two argon atoms."""
+    six = (ARGON["sigma"] / r) ** 6
+    return 4 * ARGON["epsilon"] * (six**2 - six), 24 * ARGON["epsilon"] * (2 * six**2 - six) / r
+
+
+def write_argon_table(path, rows=700, first=2.6, with_forces=False):
+    r = np.linspace(first, 9.2, rows)
+    columns = np.column_stack([r, *argon_energy(r)][: 3 if with_forces else 2])
+    head = "r_A, energy_kJ_mol, force_kJ_mol_A" if with_forces else "r_A energy_kJ_mol"
+    separator = ", " if with_forces else "  "
+    lines = ["# argon", "", head, *(separator.join(f"{x:.12g}" for x in row) for row in columns)]
+    path.write_text("\n".join(lines) + "  # the end\n")
+
+
+def tabulated(folder, count=60, edge=19.0, **entry):
+    """Argon with the table argon.csv, or without an entry with the built-in potential."""
+    forces = {"cutoff_A": 9.0}
+    if entry:
+        forces |= {"lennard_jones": False, "custom": [{"name": "argon", "table": "argon.csv"} | entry]}
+    return small_scene(
+        {"argon": count}, edge, folder, forces=forces, stages=[{"duration_ps": 0.4, "timestep_fs": 4}],
+        start={"temperature_K": 90.0}, output={"trajectory": False, "figures": False, "log_interval_ps": 0.02},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("with_forces", [False, True])
+def test_a_table_in_a_file_is_the_potential_that_it_lists(with_forces, tmp_path):
+    write_argon_table(tmp_path / "argon.csv", with_forces=with_forces)
+    scene = tabulated(tmp_path, sites=("AR",))
+    text = describe(scene)
+    assert "argon: argon.csv of 700 energies from 2.6 to 9.2 Å, 60 sites, cutoff 9 Å, switch" in text
+    error = float(re.search(r"argon: the error of its spline is (\S+) of its deepest energy", text)[1])
+    assert 1e-9 < error < 2e-5
+    exact, of_table = (rigidmd.Simulation(one).run() for one in (tabulated(tmp_path), scene))
+    start = [results["potential"][0] for results in (exact, of_table)]
+    depth, pairs = ARGON["epsilon"], 60 * 14
+    assert abs(start[0] - start[1]) < 3 * error * depth * pairs
+    assert np.abs(exact["conserved"] - of_table["conserved"]).max() < 1e-3
+    drift = [np.ptp(results["conserved"]) for results in (exact, of_table)]
+    assert drift[1] < 1.1 * drift[0]
+
+
+def test_a_table_ends_in_a_wall(tmp_path):
+    """Nearer than the first row, value and slope are those of the first row, and the energy rises as r⁻¹²."""
+    write_argon_table(tmp_path / "argon.csv", first=3.1)
+    law = rigidmd.pair_law(table=str(tmp_path / "argon.csv"))
+    radial = law.formula(9.0).radial({"scale": 1.0})
+    energy, force = argon_energy(3.1)
+    below, above = radial(3.1 - 1e-7), radial(3.1 + 1e-7)
+    assert below[:2] == pytest.approx(above[:2], rel=1e-5)
+    assert below[:2] == pytest.approx((energy * KJ_PER_MOL, force * KJ_PER_MOL), rel=1e-3)
+    for r in (3.0, 2.5, 2.0, 1.6):
+        wall = energy + 3.1 * force / 12 * ((3.1 / r) ** 12 - 1)
+        assert radial(r)[0] == pytest.approx(wall * KJ_PER_MOL, rel=1e-3)
+        assert radial(r)[1] == pytest.approx((radial(r - 1e-5)[0] - radial(r + 1e-5)[0]) / 2e-5, rel=1e-5)
+    scene = tabulated(tmp_path, count=2, edge=30.0, sites=("AR",))
+    _, engine, state = shaken(build(scene), 0, 0.0)
+    for r in (2.2, 3.05, 4.0):
+        state.position[:] = [[5.0, 5.0, 5.0], [5.0 + r, 5.0, 5.0]]
+        load, tallies = engine.evaluate(state)
+        assert tallies["argon"].energy == pytest.approx(radial(r)[0], rel=1e-12)
+        assert load.force[1, 0] == pytest.approx(radial(r)[1], rel=1e-10)
+
+
+def test_a_run_with_a_table_resumes_with_the_same_bits_and_keeps_a_copy(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_argon_table(tmp_path / "argon.csv")
+    data = tabulated(tmp_path, sites=("AR",)).model_dump(exclude_none=True)
+    same_after_stops(data, [30, 61], tmp_path)
+    again = rigidmd.Scene.read(tmp_path / "whole" / "scene.toml")
+    copy = tmp_path / "whole" / again.forces.custom[0].table
+    assert copy.read_bytes() == (tmp_path / "argon.csv").read_bytes()
+    write_argon_table(tmp_path / "argon.csv", rows=500)
+    with pytest.raises(rigidmd.errors.RigidMDError, match=r"forces\.custom\.0\.table"):
+        rigidmd.Simulation(rigidmd.Scene.from_dict(data), tmp_path / "parts", resume=True).run()
+
+
+ROWS = "\n".join(f"{r:.3f} {argon_energy(r)[0]:.6g}" for r in np.arange(3.0, 9.3, 0.05))
+WRONG_TABLES = {
+    "r_nm energy_kJ_mol\n" + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol; they must be r_A \(Å\)",
+    ROWS + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have 2: r_A, energy_kJ_mol",
+    ROWS + "\n9.4 nan": r"argon.csv: line 128: 9.4 nan has something else than finite numbers",
+    ROWS + "\n9.4 abc": r"argon.csv: line 128: 9.4 abc has something else than finite numbers",
+    ROWS + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before; sort the rows",
+    "-1 5\n" + ROWS: r"argon.csv: line 1: r_A = -1 must be above 0",
+    "\n".join(ROWS.splitlines()[:7]): r"argon.csv: has 7 rows, needs 8 or more",
+    "# nothing": r"argon.csv: has 0 rows",
+    "\n".join(ROWS.splitlines()[:60]): r"ends at 5.95 Å, before the cutoff of 9 Å$",
+    "\n".join(f"{float(row.split()[0]) / 10} {row.split()[1]}" for row in ROWS.splitlines()): r"is it in nm\?",
+    "\n".join(ROWS.splitlines()[20:]): r"begins at 4 Å, where it does not repel",
+    "\n".join(f"{row} {-argon_energy(float(row.split()[0]))[1]:.6g}" for row in ROWS.splitlines()):
+        r"the forces are not -dE/dr. From 3 to 3.05 Å the energy changes by -\S+ kJ/mol, .*Have they another sign or unit\?",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", WRONG_TABLES, ids=range(len(WRONG_TABLES)))
+def test_a_table_that_is_no_use_is_told(text, tmp_path):
+    (tmp_path / "argon.csv").write_text(text + "\n")
+    with pytest.raises(SceneError, match=WRONG_TABLES[text]):
+        build(tabulated(tmp_path, sites=("AR",)))
+
+
+def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
+    (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
+    with pytest.raises(SceneError) as told:
+        build(tabulated(tmp_path, sites=("AR",)))
+    *first, last = told.value.errors
+    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in first] == [*"12345"]
+    assert last.endswith("argon.csv: and 4 more errors")
+    with pytest.raises(SceneError, match=r"forces.custom.0.table: '../argon.csv' is outside the scene's folder"):
+        tabulated(tmp_path, table="../argon.csv")
+    with pytest.raises(SceneError, match="there is no such file"):
+        build(tabulated(tmp_path, table="other.csv"))
+    with pytest.raises(SceneError, match=r"give a module, .* an energy, .* or a table"):
+        tabulated(tmp_path, energy="1/r**9")
+
+
 @pytest.mark.parametrize(
     "arguments, word",
     [
@@ -446,7 +571,8 @@ def test_parameters_may_come_from_the_model():
         ({"energy": "1/r", "cutoff_A": True}, "above 0"),
         ({"energy": "k/r", "parameters": {"r": 1.0}}, "is the distance"),
         ({"energy": "k/r", "mixing": "geometric"}, "must be a dictionary"),
-        ({"table": "x.dat"}, "two lists"),
+        ({"table": "x.dat"}, "x.dat: there is no such file"),
+        ({"table": [1.0]}, "must be a file, or lists"),
     ],
 )
 def test_a_law_that_makes_no_sense_is_told_at_once(arguments, word):

@@ -135,7 +135,8 @@ def _describe_molecules(system: System) -> str:
 def _describe_term(system: System, term: NamedTuple) -> str:
     if not isinstance(term, PairForces):
         return type(term).__name__
-    reach = f"cutoff {system.cutoff:g} Å" if system.cutoff < inf else "no cutoff"
-    if system.cutoff < inf and hasattr(term.potential, "truncation"):
+    cutoff: float = term.potential.cutoff  # type: ignore[attr-defined]  # every pair potential has a cutoff
+    reach = f"cutoff {cutoff:g} Å" if cutoff < inf else "no cutoff"
+    if cutoff < inf and hasattr(term.potential, "truncation"):
         reach += f", {system.scene.forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"

@@ -531,8 +531,12 @@ def formula_of_table(
     if not (finite and (np.diff(r) > 0).all() and r[0] > 0):
         raise FormulaError(f"{name} needs ascending distances above 0, and finite energies")
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
-        unit = "; is it in nm?" if 10 * r[-1] >= cutoff else ""
+        unit = "; is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
         raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
+
+    size = np.abs(u[u <= 0]).max(initial=0.0) or np.abs(u).max()
+    if f is not None:
+        _check_forces(name, r, u, f, 10 * size)
 
     def interpolated(rows: slice) -> PPoly:
         values = KJ_PER_MOL * u[rows]
@@ -546,13 +550,10 @@ def formula_of_table(
     read = CubicSpline(square, spline(np.sqrt(square)), bc_type=((1, slope[0]), (1, slope[1])))
     step = square[1] - square[0]
     middle = np.sqrt(0.5 * (square[1:] + square[:-1]))
-    size = np.abs(u[u <= 0]).max(initial=0.0) * KJ_PER_MOL or np.abs(u).max() * KJ_PER_MOL
-    near = middle[spline(middle) < 10 * size]
+    near = middle[spline(middle) < 10 * KJ_PER_MOL * size]
     near = near[near <= r[::2][-1]]
     error = np.abs(coarse(near) - spline(near)).max(initial=0.0) / 16
-    error += np.abs(read(near**2) - spline(near)).max(initial=0.0)
-    if f is not None:
-        _check_forces(name, r, u, f, 10 * size / KJ_PER_MOL)
+    error = float(error + np.abs(read(near**2) - spline(near)).max(initial=0.0)) / (KJ_PER_MOL * size)
     if (steps := int(0.75 * square[0] / step)) > 0:
         inner = square[0] - step * np.arange(steps, -1, -1.0)
         six = (square[0] / inner) ** 6
@@ -573,7 +574,7 @@ def formula_of_table(
 
     table = Table(float(read.x[0]), float(1 / step), coefficients)
     text = f"{name} of {len(r)} energies from {r[0]:g} to {r[-1]:g} Å"
-    return Formula(text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, float(error / size))
+    return Formula(text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, error)
 
 
 def _check_forces(name: str, r: np.ndarray, u: np.ndarray, f: np.ndarray, high: float) -> None:
