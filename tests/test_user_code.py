@@ -520,7 +520,7 @@ def test_a_run_with_a_table_resumes_with_the_same_bits_and_keeps_a_copy(tmp_path
 ROWS = "\n".join(f"{r:.3f} {argon_energy(r)[0]:.6g}" for r in np.arange(3.0, 9.3, 0.05))
 WRONG_TABLES = {
     "r_nm energy_kJ_mol\n" + ROWS: r"argon.csv: line 1: the columns are r_nm, energy_kJ_mol; they must be r_A \(Å\)",
-    ROWS + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have 2: r_A, energy_kJ_mol",
+    ROWS + "\n9.4": r"argon.csv: line 128: has 1 numbers, must have the same columns in all lines: r_A",
     ROWS + "\n9.4 nan": r"argon.csv: line 128: 9.4 nan has something else than finite numbers",
     ROWS + "\n9.4 abc": r"argon.csv: line 128: 9.4 abc has something else than finite numbers",
     ROWS + "\n9.0 -0.1": r"argon.csv: line 128: r_A = 9 must be above 9.3 Å of the row before; sort the rows",
@@ -546,9 +546,7 @@ def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
     (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
     with pytest.raises(SceneError) as told:
         build(tabulated(tmp_path, sites=("AR",)))
-    *first, last = told.value.errors
-    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in first] == [*"12345"]
-    assert last.endswith("argon.csv: and 4 more errors")
+    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in told.value.errors] == [*"123456789"]
     with pytest.raises(SceneError, match=r"forces.custom.0.table: '../argon.csv' is outside the scene's folder"):
         tabulated(tmp_path, table="../argon.csv")
     with pytest.raises(SceneError, match="there is no such file"):

@@ -9,7 +9,6 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
-from rigidmd.assemble.terms import describe_fields
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
@@ -101,9 +100,11 @@ def _describe_molecules(system: System) -> str:
         lines.append("  no box")
     lines += [f"  {note}" for note in system.notes]
     lines.append("\ncompiled in:")
-    descriptions = describe_fields(scene, system.terms) | system.user_terms
+    fields = scene.fields.entries
     for name, term in system.terms.items():
-        lines.append(f"  {name.replace('_', ' ')}: {descriptions.get(name) or _describe_term(system, term)}")
+        of_field = fields[name][0].sentence(fields[name][1], term) if name in fields else ""
+        description = system.user_terms.get(name) or of_field or _describe_term(system, term)
+        lines.append(f"  {name.replace('_', ' ')}: {description}")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if system.thermostat is not None:

@@ -69,12 +69,6 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
     return moved
 
 
-def describe_fields(scene: MolecularScene, terms: dict[str, NamedTuple]) -> dict[str, str]:
-    """Descriptions of the terms of the fields, by name."""
-    entries = scene.fields.entries.items()
-    return {name: kind.sentence(entry, terms[name]) for name, (kind, entry, _) in entries if name in terms}
-
-
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
     """What is not compiled for this scene, and why."""
     forces, has_images = scene.forces, "coulomb_reciprocal" in terms

@@ -47,31 +47,23 @@ class SystemParts(NamedTuple):
         return PairForces(potential, sites, exclusion_groups(sites, ~self.moves[self.model.species]))
 
     @property
-    def charged(self) -> "ChargedSites":
-        indices = [np.flatnonzero(m.charges != 0) for m in self.species]
-        charge = gather_per_molecule(
-            [m.charges[c] for m, c in zip(self.species, indices, strict=True)], self.model.species
-        )
-        return ChargedSites(self, indices, self.sites(indices), charge)
+    def counts(self) -> np.ndarray:
+        """Molecules of each species (species,)."""
+        return np.bincount(self.model.species, minlength=len(self.species))
 
-
-class ChargedSites(NamedTuple):
-    """The charged sites of a system."""
-
-    parts: SystemParts
-    indices: list[np.ndarray]  # charged sites of each species
-    sites: BodySites | CentralSites
-    charge_e: np.ndarray  # (s,)
+    def charged(self) -> tuple[BodySites | CentralSites, np.ndarray]:
+        """The charged sites, and their charges (s,) in e."""
+        charges = gather_per_molecule([m.charges[m.charges != 0] for m in self.species], self.model.species)
+        return self.sites([np.flatnonzero(m.charges != 0) for m in self.species]), charges
 
     def sum_over_molecules(self, energy: Callable[[np.ndarray, np.ndarray], float]) -> float:
-        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen."""
-        total, parts = 0.0, self.parts
-        for m, c, moves, count in zip(
-            parts.species, self.indices, parts.moves, np.bincount(parts.model.species, minlength=len(parts.species)),
-            strict=True,
-        ):  # fmt: skip
+        """Sum of energy(charges (s,) in energy units, positions (s, 3)) over the molecules that are not frozen, of
+        their charged sites."""
+        total = 0.0
+        for m, moves, count in zip(self.species, self.moves, self.counts, strict=True):
             if moves and count:
-                total += int(count) * energy(m.charges[c] * COULOMB_CHARGE, m.positions_body[c])
+                charge, position = m.charges[m.charges != 0], m.positions_body[m.charges != 0]
+                total += int(count) * energy(charge * COULOMB_CHARGE, position)
         return total
 
 

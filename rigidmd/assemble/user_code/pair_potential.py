@@ -45,7 +45,7 @@ Parameters = Mapping[str, float]
 REACH = 20.0
 #: Columns of the file of a tabulated potential, of which the last may be missing; the names have the units.
 COLUMNS = ("r_A", "energy_kJ_mol", "force_kJ_mol_A")
-LARGEST_TABLE, MOST_TABLE_ERRORS = 20_000_000, 5  # bytes; errors that are listed
+LARGEST_TABLE = 20_000_000  # bytes
 
 
 class Columns(NamedTuple):
@@ -388,7 +388,7 @@ def pair_law(
 
 def read_columns(path: Path) -> Columns:
     """The table of a file: numbers separated by commas or white space, comments after #, and perhaps a line with the
-    names of `COLUMNS` first. Raises PairPotentialError with all errors, up to MOST_TABLE_ERRORS."""
+    names of `COLUMNS` first. Raises PairPotentialError with all errors."""
     try:
         reason = unreadable_reason(path, LARGEST_TABLE)
         text = "" if reason else path.read_text(encoding="utf-8-sig")
@@ -400,17 +400,17 @@ def read_columns(path: Path) -> Columns:
     lines = [(k, line.partition("#")[0].replace(",", " ").split()) for k, line in enumerate(text.splitlines(), 1)]
     lines = [(k, words) for k, words in lines if words]
     if lines and not _is_number(lines[0][1][0]):
-        (number, given), lines = lines[0], lines[1:]
-        names = tuple(given)
+        (number, names), lines = lines[0], lines[1:]
         if not {*COLUMNS[:2]} <= {*names} <= {*COLUMNS} or len({*names}) < len(names):
             known = "r_A (Å), energy_kJ_mol (kJ/mol) and, if you like, force_kJ_mol_A (-dE/dr, kJ/mol/Å)"
             raise PairPotentialError(f"{path}: line {number}: the columns are {', '.join(names)}; they must be {known}")
     for number, words in lines:
         values = [float(word) if _is_number(word) else inf for word in words]
-        row = dict(zip(names, values, strict=False))
-        if not 2 <= len(words) <= len(names) or (rows and len(words) != len(rows[0])):
-            expected = len(rows[0]) if rows else "2 or 3" if names == COLUMNS else len(names)
-            faults.append(f"line {number}: has {len(words)} numbers, must have {expected}: {', '.join(COLUMNS)}")
+        row, expected = dict(zip(names, values, strict=False)), (len(names),) if names is not COLUMNS else (2, 3)
+        if len(words) not in ((len(rows[0]),) if rows else expected):
+            faults.append(
+                f"line {number}: has {len(words)} numbers, must have the same columns in all lines: {', '.join(names)}"
+            )
         elif not all(map(isfinite, values)):
             faults.append(f"line {number}: {' '.join(words):.60} has something else than finite numbers")
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
@@ -421,8 +421,7 @@ def read_columns(path: Path) -> Columns:
     if not faults and len(rows) < LEAST_ROWS:
         faults.append(f"has {len(rows)} rows, needs {LEAST_ROWS} or more: one line for each distance")
     if faults:
-        more = [f"and {len(faults) - MOST_TABLE_ERRORS} more errors"] if len(faults) > MOST_TABLE_ERRORS else []
-        raise PairPotentialError(*(f"{path}: {fault}" for fault in [*faults[:MOST_TABLE_ERRORS], *more]))
+        raise PairPotentialError(*(f"{path}: {fault}" for fault in faults))
     r, energy, *force = ([row[name] for row in rows] for name in COLUMNS if name in rows[0])
     return Columns(r, energy, force[0] if force else None, path.name)
 

@@ -8,7 +8,7 @@ of the origin is a uniform field.
 from math import sqrt
 from typing import NamedTuple
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.mechanics.free_rotor import rotate_vector, sine_and_versine
 from rigidmd.mechanics.time_functions import TimeFunction, value
 
@@ -25,13 +25,9 @@ class RotatingFrame(NamedTuple):
     angular_velocity: TimeFunction  # along the axes of the frame
 
 
+@chosen_by_type(inline=True)
 def rotate_with_frame(frame, state, time, h):
     """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in place."""
-    raise TypeError("compiled code only")
-
-
-@implements(rotate_with_frame, inline=True)
-def _rotate_with_frame(frame, state, time, h):
     if is_a(frame, InertialFrame):
         return lambda frame, state, time, h: None
 
@@ -62,13 +58,9 @@ def rotate_in_place(vector, x, y, z):
     )
 
 
+@chosen_by_type(inline=True)
 def frame_rate(frame, time):
     """Angular velocity of the frame along its axes, as a tuple."""
-    raise TypeError("compiled code only")
-
-
-@implements(frame_rate, inline=True)
-def _frame_rate(frame, time):
     if is_a(frame, InertialFrame):
         return lambda frame, time: (0.0, 0.0, 0.0)
 

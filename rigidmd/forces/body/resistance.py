@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.forces.body.frame import frame_rate
 from rigidmd.mechanics.free_rotor import NoRotor, moments
@@ -36,13 +36,9 @@ class Resistance(NamedTuple):
     rotation_quadratic: np.ndarray  # (3,)
 
 
+@chosen_by_type(inline=True)
 def kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
     """Change the momenta of a single body by a load and resistance for a time h at fixed positions, in place."""
-    raise TypeError("compiled code only")
-
-
-@implements(kick_with_resistance, inline=True)
-def _kick_with_resistance(resistance, translation, rotor, frame, state, load, h):
     flies, turns = not is_a(translation, NoTranslation), not is_a(rotor, NoRotor)
     if is_a(resistance, NoResistance):
 
@@ -137,13 +133,9 @@ def speed_after_half_kick(before, pushes, dries, inverse, linear, quadratic, h, 
     return sqrt(squares)
 
 
+@chosen_by_type
 def kick_translation(resistance, translation, rotor, frame, state, load, h):
     """Change the velocity (or impulse over mass) by force and resistance; |v| is found like |w| in `kick_rotation`."""
-    raise TypeError("compiled code only")
-
-
-@implements(kick_translation)
-def _kick_translation(resistance, translation, rotor, frame, state, load, h):
     turns = not is_a(rotor, NoRotor)
 
     def kick_translation(resistance, translation, rotor, frame, state, load, h):
@@ -231,13 +223,9 @@ def drag_integrals(linear, h):
     return first, (h - first) / linear
 
 
+@chosen_by_type
 def add_resistance(resistance, state, load, velocity, omega):
     """Add resistance to a load, and return its power; velocity (lab), angular velocity (body) relative to the frame."""
-    raise TypeError("compiled code only")
-
-
-@implements(add_resistance)
-def _add_resistance(resistance, state, load, velocity, omega):
     if is_a(resistance, NoResistance):
         return lambda resistance, state, load, velocity, omega: 0.0
 

@@ -40,7 +40,7 @@ class SurfaceDipole(NamedTuple):
     """Response of the medium around a large sphere of boxes to its dipole: energy 2 pi/((2 eps + 1) V) |sum q r|²."""
 
     strength: float  # 2 pi/(2 eps + 1)
-    charge: np.ndarray  # (s,)
+    charge: np.ndarray  # (s,) sum to 0, in units where q²/r is an energy in u Å²/ps²
     sites: BodySites | CentralSites
 
     acts_on_charges = True
@@ -55,11 +55,6 @@ class SurfaceWorkspace(NamedTuple):
     sites: BodySites | CentralSites
     position: np.ndarray  # (s, 3)
     site_force: np.ndarray  # (s, 3) as last evaluated, lab frame, u Å/ps²
-
-
-def surface_dipole(charge: np.ndarray, permittivity: float, sites: BodySites | CentralSites) -> SurfaceDipole:
-    """The term for charges (s,) that sum to 0, in units where q²/r is an energy in u Å²/ps²."""
-    return SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
 
 
 @implements(terms.add_forces, SurfaceWorkspace)

@@ -1,7 +1,7 @@
 """Ewald sums of a scene, electrostatics = "ewald" and "pme": settings, terms, constants of rigid molecules."""
 
 from math import inf, pi, prod, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,9 @@ from rigidmd.forces.ewald.errors import (
     pme_grid_for,
     real_error,
 )  # fmt: skip
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
-from rigidmd.forces.parts import ChargedSites, Composition, Interactions, Settings, SystemParts
+from rigidmd.forces.parts import Composition, Interactions, Settings, SystemParts
 from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
@@ -109,27 +110,17 @@ def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> fl
     return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
 
-class _Errors(NamedTuple):
-    """Truncation errors and k-vectors of an Ewald sum."""
-
-    real: float  # e²/Å², see `ewald.errors`
-    k_space: float
-    vectors: k_vectors.KVectors | None  # with PME only for the interactions of frozen molecules
-
-
-def _errors(parts: SystemParts) -> _Errors:
-    """Truncation errors and k-vectors of a resolved scene."""
+def _errors(parts: SystemParts) -> tuple[float, float, k_vectors.KVectors | None]:
+    """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME these are only for
+    the interactions of frozen molecules, and None without any. Raises SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
-    charges = charges_in(parts.species, np.bincount(parts.model.species, minlength=len(parts.species)))
-    alpha = forces.ewald_alpha_per_A
-    of_real_space = real_error(charges, alpha, forces.cutoff_A, volume)
-    reciprocal = 2 * pi * np.linalg.inv(cell).T
+    alpha, charges = forces.ewald_alpha_per_A, charges_in(parts.species, parts.counts)
+    real, reciprocal = real_error(charges, alpha, forces.cutoff_A, volume), 2 * pi * np.linalg.inv(cell).T
     if parts.grid is not None:
-        of_k_space, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
+        error, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
         if not parts.moves[parts.model.species].all():
-            radius = k_cutoff_for(charges, alpha, reciprocal, 1e-3 * of_k_space)
-            vectors = k_vectors.k_vectors_within(reciprocal, radius)
-        return _Errors(of_real_space, of_k_space, vectors)
+            vectors = k_vectors.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error))
+        return real, error, vectors
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
         most = (most, most, most)
@@ -139,72 +130,68 @@ def _errors(parts: SystemParts) -> _Errors:
         vectors = k_vectors.k_vectors_within(reciprocal, radius, most, parts.basis)
     if vectors.total == 0:
         raise SceneError(parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"])
-    beyond = k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume)
-    return _Errors(of_real_space, beyond, vectors)
+    return real, k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume), vectors
 
 
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with an Ewald sum. Raises SceneError."""
-    scene, forces, charged, found = parts.scene, parts.scene.forces, parts.charged, _errors(parts)
-    alpha, cutoff = forces.ewald_alpha_per_A, forces.cutoff_A
-    charge = charged.charge_e * COULOMB_CHARGE
+    forces, (sites, charge_e), (real, k_space, vectors) = parts.scene.forces, parts.charged(), _errors(parts)
+    alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.cutoff_A, charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
-    potential = screened_coulomb(charged.charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * found.real)
+    potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
     if parts.grid is None:
-        vectors = found.vectors
-        assert vectors is not None  # it has k-vectors without a grid
-        reciprocal = direct_sum.EwaldSum(alpha, charge, charged.sites, vectors)
+        assert vectors is not None  # with PME only, there may be none
+        reciprocal = direct_sum.EwaldSum(alpha, charge, sites, vectors)
         how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
         if forces.ewald_k_max is not None and not np.array_equal(parts.basis, k_vectors.SAME_BASIS):
             how += "; they are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
-        reciprocal = Pme(alpha, charge, charged.sites, parts.grid, forces.pme_order)
+        reciprocal = Pme(alpha, charge, sites, parts.grid, forces.pme_order)
         how = f"grid {' x '.join(map(str, parts.grid))}, splines of order {forces.pme_order}"
-    terms = {"coulomb_real": parts.pair_forces(potential, charged.sites), "coulomb_reciprocal": reciprocal}
+    terms = {"coulomb_real": parts.pair_forces(potential, sites), "coulomb_reciprocal": reciprocal}
     constants = {
         # The shift applies to all charges within the cutoff of a charge, which together are nearly neutral, including
         # the charge itself and its molecule. The pair loop leaves these out; this constant adds them.
-        "coulomb_self": charged.sum_over_molecules(
+        "coulomb_self": parts.sum_over_molecules(
             lambda q, x: corrections.self_energy(q, alpha) - 0.5 * potential.shift * float(q.sum()) ** 2
         ),
-        "coulomb_intramolecular": charged.sum_over_molecules(
-            lambda q, x: corrections.intramolecular_energy(q, x, alpha)
-        ),
+        "coulomb_intramolecular": parts.sum_over_molecules(lambda q, x: corrections.intramolecular_energy(q, x, alpha)),
     }
-    error = float(np.hypot(found.real, found.k_space))
+    error = float(np.hypot(real, k_space))
     notes = [
         f"{forces.electrostatics}: alpha {alpha:.6g} 1/Å, cutoff {cutoff:g} Å, {how}"
         + ("" if potential.shift == 0 else "; energies of real space shifted to 0 at the cutoff"),
         f"estimated rms error of the force on a site: {error:.2g} e²/Å² = {error * COULOMB / KJ_PER_MOL:.2g} "
-        f"kJ/(mol Å); {found.real:.2g} beyond the cutoff, {found.k_space:.2g} in the reciprocal part",
+        f"kJ/(mol Å); {real:.2g} beyond the cutoff, {k_space:.2g} in the reciprocal part",
     ]
-    frozen_sites = ~parts.moves[parts.model.species][charged.sites.molecule]
+    frozen_sites = ~parts.moves[parts.model.species][sites.molecule]
     net, net_frozen = charge.sum(), charge[frozen_sites].sum()
     neutral = abs(net) <= NEUTRAL * np.abs(charge).sum()
     if not neutral:
         terms["coulomb_background"] = corrections.background(net**2 - net_frozen**2, alpha)
         notes.append(
-            f"the box has a net charge of {charged.charge_e.sum():+.6g} e; an even background of the opposite charge "
+            f"the box has a net charge of {charge_e.sum():+.6g} e; an even background of the opposite charge "
             "makes it neutral, and energies and pressure depend on the size of the box"
         )
     if (permittivity := forces.ewald_surface_permittivity) < inf:
         if not neutral:
             why = "the dipole of a box with a net charge is not defined; leave it out"
-            raise SceneError(scene.source, [f"forces.ewald_surface_permittivity: {why}"])
-        terms["coulomb_surface"] = corrections.surface_dipole(charge, permittivity, charged.sites)
+            raise SceneError(parts.scene.source, [f"forces.ewald_surface_permittivity: {why}"])
+        terms["coulomb_surface"] = corrections.SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
     pressure = 0.0
     if frozen_sites.any():
-        assert found.vectors is not None  # it has k-vectors with frozen molecules
-        constants["coulomb_frozen"], pressure = _frozen_correction(charged, charge * frozen_sites, found.vectors)
+        assert vectors is not None  # with frozen molecules there are some
+        constants["coulomb_frozen"], pressure = _frozen_correction(parts, sites, charge * frozen_sites, vectors)
     return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
 
 
-def _frozen_correction(charged: ChargedSites, charge: np.ndarray, vectors: k_vectors.KVectors) -> tuple[float, float]:
+def _frozen_correction(
+    parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray, vectors: k_vectors.KVectors
+) -> tuple[float, float]:
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
     (s,) is 0 for sites that move."""
-    sites, parts = charged.sites, charged.parts
     state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
     arms = np.zeros((len(charge), 3))
     if len(state.rotation):

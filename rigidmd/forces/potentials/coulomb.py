@@ -59,16 +59,15 @@ def reaction_field(
 
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with electrostatics = "reaction_field"."""
-    forces, charged = parts.scene.forces, parts.charged
+    forces, (sites, charge) = parts.scene.forces, parts.charged()
     cutoff = forces.cutoff_A or inf
     start = forces.switch_start_A or cutoff
-    potential = reaction_field(charged.charge_e, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
-    terms, constants = {"coulomb": parts.pair_forces(potential, charged.sites)}, {}
+    potential = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
+    constants = {}
     if cutoff < inf:
-        constants["reaction_field_self"] = charged.sum_over_molecules(
-            lambda q, x: self_energy(potential._replace(charge=q), x)
-        )
-    return Interactions(terms, constants)
+        energy = parts.sum_over_molecules(lambda q, x: self_energy(potential._replace(charge=q), x))
+        constants["reaction_field_self"] = energy
+    return Interactions({"coulomb": parts.pair_forces(potential, sites)}, constants)
 
 
 @chosen_by_type(inline=True)

@@ -209,10 +209,10 @@ def screening_errors(key: str, alpha: float | None, cutoff: float) -> list[str]:
 
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with electrostatics = "damped_shifted_force"."""
-    forces, charged = parts.scene.forces, parts.charged
-    potential = damped_shifted_force(charged.charge_e, forces.cutoff_A or inf, forces.damping_per_A)
-    constant = charged.sum_over_molecules(lambda q, x: damped_self_energy(potential._replace(charge=q), x))
-    return Interactions({"coulomb": parts.pair_forces(potential, charged.sites)}, {"damped_self": constant})
+    forces, (sites, charge) = parts.scene.forces, parts.charged()
+    potential = damped_shifted_force(charge, forces.cutoff_A or inf, forces.damping_per_A)
+    constant = parts.sum_over_molecules(lambda q, x: damped_self_energy(potential._replace(charge=q), x))
+    return Interactions({"coulomb": parts.pair_forces(potential, sites)}, {"damped_self": constant})
 
 
 @chosen_by_type(inline=True)
