@@ -86,7 +86,8 @@ class PairLaw:
         """The formula that is compiled. Raises PairPotentialError."""
         try:
             if self.table is not None:
-                return formula_of_table(*self.table, cutoff=cutoff)
+                r, energy, force, name = self.table
+                return formula_of_table(r, energy, cutoff, force, name)
             if isinstance(self.energy, str):
                 return formula_of_text(self.energy, self.constants)
             assert self.formula_of_function is not None  # it has a text, a function or a table

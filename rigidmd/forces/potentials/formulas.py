@@ -507,8 +507,8 @@ def _class_for(kind: type, function: Callable) -> type:
 
 
 def formula_of_table(
-    distance: Sequence[float], energy: Sequence[float], force: Sequence[float] | None = None, name: str = "a table",
-    cutoff: float = inf,
+    distance: Sequence[float], energy: Sequence[float], cutoff: float, force: Sequence[float] | None = None,
+    name: str = "a table",
 ) -> Formula:  # fmt: skip
     """The formula of energies (kJ/mol) at ascending distances (Å), which must reach from contact to the cutoff.
 
