@@ -26,6 +26,11 @@ PAST = {
     "test_simd.py": (["rigidmd.compile"], OPEN),
     "test_threads.py": (["rigidmd.compile"], OPEN),
     "test_checks.py": (["rigidmd.compile"], "a script of a user who compiles a function"),
+    "test_fields.py": (
+        ["rigidmd.compile", "rigidmd.core.state", "rigidmd.forces.terms"],
+        "a new field as a file of the package",
+    ),
+    "test_forces.py": (["rigidmd.compile", "rigidmd.forces"], "a new pair potential as a file of the package"),
     "test_run.py": (["rigidmd.commands.arguments"], "a command in a file of its own"),
     "test_strangers.py": (["rigidmd.core.process"], "a script in so little memory that it loads nothing else"),
 }
