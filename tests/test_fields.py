@@ -627,7 +627,7 @@ def test_adding_a_field_takes_two_files(tmp_path):
         "forces/fields/trap.py": TRAP,
     }
     assert len(files) == 2
-    found = json.loads(run_with_files(tmp_path, files, TRAP_SCRIPT))
+    found = json.loads(run_with_files(tmp_path, files, TRAP_SCRIPT).splitlines()[-1])
     assert found["energy"] == pytest.approx(found["expected"])
     assert found["force"] == pytest.approx(found["sum"])
     assert "  trap: 0.5 kJ/mol/Å²\n" in found["check"]

@@ -825,7 +825,7 @@ def test_adding_a_pair_potential_takes_two_files(tmp_path):
     }
     assert len(files) == 2
     (tmp_path / "soft.toml").write_text(SOFT_SCENE)
-    found = json.loads(run_with_files(tmp_path, files, SOFT_SCRIPT))
+    found = json.loads(run_with_files(tmp_path, files, SOFT_SCRIPT).splitlines()[-1])
     assert found["energy"] == pytest.approx(found["expected"], rel=1e-12)
     assert found["force_error"] < 1e-6 * found["force"]
     assert found["same_bits"]

@@ -436,7 +436,7 @@ def test_parameters_may_come_from_the_model():
 
 # --- tables in files -------------------------------------------------------------------------------------------------
 
-ARGON = {"sigma": 3.405, "epsilon": 0.996}  # of the shipped model, Å and kJ/mol
+ARGON = {"sigma": 3.405, "epsilon": 119.8 * 8.31446261815324e-3}  # of the shipped model, Å and kJ/mol
 
 
 def argon_energy(r):
