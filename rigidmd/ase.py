@@ -24,7 +24,8 @@ from rigidmd.core.state import State, state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
-from rigidmd.io.cells import basis_of, least_skewed_cell, standard_rotation
+from rigidmd.io.formats import STRUCTURE
+from rigidmd.io.formats.cells import basis_of, least_skewed_cell, standard_rotation
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.run.atom_forces import Form, ase_results
 from rigidmd.run.minimise import minimise
@@ -194,7 +195,7 @@ class RigidMD(Calculator):
         species = species_of(scene)
         content = scene.embedded_files["structure.file"]
         cell = atoms.cell.array if atoms.pbc.all() else None
-        matched = match(read_atoms(Path("atoms.xyz"), content=content), species, cell, self._tolerance)
+        matched = match(read_atoms(Path(STRUCTURE), content=content), species, cell, self._tolerance)
         if isinstance(matched, list):
             raise StructureError(SOURCE, matched)
         basis = np.eye(3)

@@ -115,7 +115,6 @@ def structures() -> dict[str, str]:
         f"ATOM  {k:5} {n:4} SOL A{m + 1:4}    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00           {n}\n"
         for k, (m, n, x, y, z) in rows
     )
-    arc = "".join(f"{k} {n} {x} {y} {z} 1\n" for k, (_, n, x, y, z) in rows)
     cif = "".join(f"{n}{k} {n} {x / 18} {y / 18} {z / 18} 1.0\n" for k, (_, n, x, y, z) in rows)
     data = "".join(f"{k} {m + 1} {1 if n == 'O' else 2} 0.0 {x} {y} {z}\n" for k, (m, n, x, y, z) in rows)
     dump = "".join(f"{k} {n} {x} {y} {z}\n" for k, (_, n, x, y, z) in rows)
@@ -129,9 +128,7 @@ def structures() -> dict[str, str]:
         "x.xyz": f"{len(rows)}\nwater\n{xyz}",
         "y.xyz": f"{len(rows)}\n{lattice}\n{xyz}",
         "x.pdb": f"CRYST1   18.000   18.000   18.000  90.00  90.00  90.00 P 1           1\n{pdb}END\n",
-        "x.arc": f"{len(rows)} water\n18.0 18.0 18.0 90.0 90.0 90.0\n{arc}",
         "x.cif": f"data_x\n{edges}{angles}loop_\n{columns}{cif}",
-        "x.cssr": f" 18.0 18.0 18.0\n 90.0 90.0 90.0 SPGR = 1 P 1\n {len(rows)} 1\n water\n{arc}",
         "x.dump": f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(rows)}\nITEM: BOX BOUNDS pp pp pp\n0 18\n0 18\n0 18\nITEM: ATOMS id element x y z\n{dump}",
         "x.data": f"units = real\n\n{len(rows)} atoms\n2 atom types\n0 18 xlo xhi\n0 18 ylo yhi\n0 18 zlo zhi\n\nMasses\n\n1 15.999\n2 1.008\n\nAtoms # full\n\n{data}",
     }

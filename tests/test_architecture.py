@@ -2,19 +2,20 @@
 
 import ast
 import functools
+import re
 import subprocess
 import sys
 import tomllib
 
 import pytest
-from support import COMPILED, ROOT
+from support import BY_EXTENSION, COMPILED, ROOT
 
 PACKAGE = ROOT / "rigidmd"
 
-#: From the bottom up: a package imports from those before it and from itself.
+#: From the bottom up: a package imports from those before it and from itself. A subpackage may have a layer of its own.
 LAYERS = (
-    "errors", "units", "core", "compile", "mechanics", "forces", "dynamics", "scene", "engines", "io", "figures",
-    "assemble", "run", "analysis", "view", "studies", "ase", "commands",
+    "errors", "units", "core", "compile", "mechanics", "forces", "dynamics", "io.formats", "scene", "engines", "io",
+    "figures", "assemble", "run", "analysis", "view", "studies", "ase", "commands",
 )  # fmt: skip
 #: `rigidmd` itself and `python -m rigidmd` are above all packages.
 ABOVE_ALL = ("__init__", "__main__")
@@ -47,8 +48,15 @@ def name_of(path):
     return path.relative_to(PACKAGE).as_posix()
 
 
+def layer_of(module):
+    """The layer of a module, "" is `rigidmd` itself: the longest entry of LAYERS that its dotted name begins with."""
+    names = module.split(".")
+    found = [".".join(names[:k]) for k in range(len(names), 0, -1)]
+    return next((name for name in found if name in RANK), names[0] or "__init__")
+
+
 def package_of(path):
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+    return layer_of(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
 
 
 def imports_in(source):
@@ -75,9 +83,9 @@ def upward(package, found):
     """'line: imports module, ...' for imports (line, module) from packages above, and from the package rigidmd itself."""
     for line, module in found:
         root, _, rest = module.partition(".")
-        other = rest.partition(".")[0]
-        if root == "rigidmd" and RANK[other or "__init__"] > RANK[package]:
-            yield f"{line}: imports {module}: {package} is below {other or 'rigidmd'}"
+        other = layer_of(rest)
+        if root == "rigidmd" and RANK[other] > RANK[package]:
+            yield f"{line}: imports {module}: {package} is below {other.replace('__init__', 'rigidmd')}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -102,6 +110,9 @@ def build():
 """.replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
     assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == ["6", "8", "9", "10"]
     assert not list(upward("__init__", imports_in(source)))
+    inner = [(1, "rigidmd.io.formats.xtc"), (2, "rigidmd.io.formats"), (3, "rigidmd.io.trajectory"), (4, "rigidmd.io")]
+    assert [message.split(":")[0] for message in upward("scene", inner)] == ["3", "4"]
+    assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -131,6 +142,30 @@ def test_the_digest_that_names_the_cache_includes_all_compiled_code():
             kernels = [m for _, m in ours if m.startswith("rigidmd.compile")]
             allowed = {"rigidmd.compile.machine", "rigidmd.compile.cache"}  # about the processor and the cache
             assert set(kernels) <= allowed, f"{name_of(path)} compiles"
+
+
+#: Files that name extensions of structures or trajectories in texts for users -> what for.
+NAMED_EXTENSIONS = {
+    "commands/models.py": "an example in --help",
+    "engines/gromacs/files.py": "the files of an export and a command of GROMACS",
+    "engines/lammps/files.py": "the files of an export, and commands of LAMMPS",
+    "engines/openmm/files.py": "the files of an export, and its script",
+}
+
+
+def test_only_a_format_names_its_extensions():
+    """In texts except docstrings; `io.formats` also has the default names of files."""
+    extension = re.compile(rf"[.]({'|'.join(name[1:] for name in BY_EXTENSION)})\b")
+    naming = {}
+    for path in FILES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and id(n) not in docstrings]
+        if found := [text for text in texts if isinstance(text, str) and extension.search(text)]:
+            naming[name_of(path)] = found
+    strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
+    assert set(strange) == set(NAMED_EXTENSIONS), strange
+    assert len(naming) > len(strange) + 8
 
 
 def is_compiled(name):

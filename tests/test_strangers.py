@@ -166,7 +166,6 @@ def test_control_characters_of_a_model_are_not_printed(capsys, tmp_path):
         ("x.cif", "1.0\n", "?\n", "x.cif: some of its sites have the occupancy ?"),
         ("x.xyz", "O 2.0 ", "O 1e200 ", "x.xyz: an atom is at 1e+200 Å, farther than 1e+09 Å"),
         ("y.xyz", '"18.0', '"0.1', "y.xyz: its box: with its edges of 0.1, 18, 18 Å it is 0.1 Å thick"),
-        ("x.arc", "18.0 18.0 18.0 90.0 90.0", "18.0 18.0 18.0 90.0 180.0", "x.arc: no cell has its edges and angles"),
         ("x.gro", "   OW", "\x1b[31m", "x.gro: atom 1 has a name with control characters"),
     ],
 )

@@ -1,6 +1,7 @@
 """Trajectories as structure files: the last frame of an earlier run, of this engine or another, or a clear message."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import ase.io
@@ -10,10 +11,10 @@ import pytest
 from MDAnalysis.analysis.dielectric import DielectricConstant
 from scenes import FORTY_WATERS, NVT, forty_waters
 from support import (
-    FORMATS,
     Frame,
     _without_rounding,
     build,
+    formats,
     from_files,
     in_memory,
     load_model,
@@ -22,8 +23,9 @@ from support import (
     read_frames,
     read_geometry,
     read_structure,
+    reader_of,
+    reading_process,
     small_scene,
-    trajectory_formats,
     write_topology,
 )
 
@@ -104,7 +106,7 @@ def test_all_readers_find_the_frames_of_many_steps_and_boxes_that_change(tmp_pat
     cells = np.linalg.norm(found.cells, axis=2)
     if ending != ".xyz":  # MDAnalysis reads no box of it
         assert np.array([frame.dimensions[:3].copy() for frame in u.trajectory]) == pytest.approx(lengths, abs=6e-4)
-        plain = mda.Universe(str(tmp_path / "topology.gro"), str(whole), format=FORMATS.get(ending))
+        plain = mda.Universe(str(tmp_path / "topology.gro"), str(whole), format=reader_of(ending))
         assert np.array([frame.dimensions[:3].copy() for frame in plain.trajectory]) == pytest.approx(lengths, abs=6e-4)
     assert cells == pytest.approx(lengths, abs=6e-4)
     assert np.array([frame.positions.copy() for frame in u.trajectory]) == pytest.approx(sites, abs=0.006)
@@ -221,7 +223,7 @@ def test_what_cannot_be_a_start(ending, fault, said, tmp_path, capsys, monkeypat
         case "crash":
             program = tmp_path / "crash.py"
             program.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
-            monkeypatch.setattr(trajectory_formats, "PROGRAM", program)
+            monkeypatch.setattr(reading_process, "PROGRAM", (str(program),))
         case "outside":
             shutil.move(folder / "topology.gro", tmp_path)
             more = 'topology = "../topology.gro"'
@@ -280,3 +282,78 @@ def test_a_run_goes_on_from_a_trajectory(tmp_path):
         Scene.from_dict(
             again | {"structure": {"file": "old/trajectory.trr", "topology": "none.gro", "velocities": True}}, tmp_path
         )
+
+
+TOY = '''"""A made-up format: a line of JSON with the names of the atoms, and a line for each frame."""
+
+import json
+from functools import partial
+
+import numpy as np
+
+from PACKAGE.io.formats import Atoms, Format, Frame
+
+
+def encoder(system, interval, velocities):
+    def encode(frame, k):
+        rows = [] if k else [system.sites.name.tolist()]
+        rows.append([frame.time, frame.positions.tolist(), frame.cell.tolist(), frame.velocities.tolist(), frame.step])
+        return "".join(f"{json.dumps(row)}\\n" for row in rows).encode()
+
+    return encode
+
+
+class Reader:
+    def __init__(self, path):
+        names, *self._rows = map(json.loads, path.read_text().splitlines())
+        self.count, self.sites = len(self._rows), len(names)
+
+    def frame(self, k):
+        time, position, cell, velocity, step = self._rows[k]
+        return Frame(time, np.array(position), np.array(cell), np.array(velocity), step=step)
+
+    def close(self):
+        pass
+
+
+def read(path, lines):
+    names, *frames = map(json.loads, lines)
+    return [partial(atoms_of, names, *frame) for frame in frames]
+
+
+def atoms_of(names, time, position, cell, velocity, step):
+    return Atoms(names, [""] * len(names), [()] * len(names), np.array(position), np.array(velocity), np.array(cell))
+
+
+FORMATS = [Format((".toy",), read=read, encoder=encoder, reader=Reader, velocities=True, double=True)]
+'''
+
+
+def test_adding_a_format_takes_one_file(tmp_path, monkeypatch):
+    """A module in the folder of formats: then runs write it and resume, results read it, and runs start from it."""
+    (tmp_path / "formats").mkdir()
+    (tmp_path / "formats" / "toy.py").write_text(TOY.replace("PACKAGE", "rigidmd"))
+    (tmp_path / "scene.toml").write_text(
+        TEXT.replace('file = "old.xtc"', 'file = "start.toy"\nframe = 2\nvelocities = true')
+    )
+    output = {"trajectory": "x.toy", "trajectory_interval_ps": 0.002}
+    monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path / "formats")])
+    try:
+        formats.find_modules()
+        results = Simulation(small_scene({"tip4p2005": 4}, 20.0, output=output), tmp_path / "run").run()
+        times = [frame.time for frame in results.universe().trajectory]
+        assert times == pytest.approx(np.arange(len(times)) * 0.002)
+        assert len(times) > 2
+        last = results.universe().trajectory[-1]
+        assert last.positions == pytest.approx(results.system.site_positions(results.state), abs=1e-5)
+        assert results.atoms(1).positions.dtype == float
+        shutil.copy(tmp_path / "run" / "x.toy", tmp_path / "start.toy")
+        again = build(Scene.read(tmp_path / "scene.toml"))
+        assert again.site_velocities(again.state) == pytest.approx(
+            results.universe().trajectory[1].velocities, abs=1e-4
+        )
+    finally:
+        formats.BY_EXTENSION.pop(".toy", None)
+        sys.modules.pop("rigidmd.io.formats.toy", None)
+    with pytest.raises(SceneError, match=r"must end in one of \.dcd \.gsd \.nc \.pdb \.traj \.trr \.xtc \.xyz"):
+        small_scene({"tip4p2005": 4}, 20.0, output=output)

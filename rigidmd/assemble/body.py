@@ -23,14 +23,12 @@ from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce
 from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
+from rigidmd.io.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor
 from rigidmd.mechanics.time_functions import values_at
 from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, NoTranslation
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
-
-#: Largest coordinate that fits into the columns of a topology file, Å.
-LARGEST_COORDINATE = {".gro": 9e4, ".pdb": 990.0}
 
 
 def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | None = None) -> BodySystem:
@@ -82,8 +80,9 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     )  # fmt: skip
     system.left_out = _left_out(system)
     if scene.output.trajectory and system.translates:
-        reach = system.scale * np.abs(system.state.position).max()
-        if not reach < LARGEST_COORDINATE[not_none(scene.output.topology)[-4:]]:
+        form = not_none(format_of(not_none(scene.output.topology)))
+        if form.exceeded(system.site_positions(system.state)) is not None:
+            reach = system.scale * np.abs(system.state.position).max()
             fault = f"start.position_m is {reach:.3g} Å in the trajectory, which {scene.output.topology} cannot hold"
             advice = "set output.trajectory_A_per_m to less, or output.trajectory = false"
             raise SceneError(scene.source, [f"{fault}: {advice}"])

@@ -18,7 +18,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import cell_of, space_of
 from rigidmd.forces.parts import Composition, SystemParts, sum_of_tails
-from rigidmd.io.cells import describe_basis, describe_cell
+from rigidmd.io.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import field_notes

@@ -16,10 +16,10 @@ from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.forces.neighbors.space import Triclinic
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
+from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, Forces
-from rigidmd.scene.molecules import WITH_VELOCITIES
 from rigidmd.scene.stage import Stage
 
 #: Default thermostat of external engines, because neither LAMMPS nor OpenMM has velocity rescaling of rigid bodies.
@@ -32,8 +32,8 @@ CUTOFF = 9.0  # Å, in a periodic box
 REMOVE_MOMENTUM_INTERVAL = 1.0
 TOLERANCE = 1e-10  # of DOP853 and RADAU
 TRAJECTORY_RADIUS = 10.0  # Å, of a body
-#: Å; the columns of a .pdb file are too narrow for coordinates below -999.
-FARTHEST_IN_PDB = 900.0
+#: Å, of a body in BODY_TOPOLOGY, whose columns are too narrow for coordinates below -999.
+FARTHEST = 900.0
 #: Largest entry of abs(QᵀQ - 1) of a body with schemes, which preserve it, and with ODE solvers, which do not.
 ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
@@ -90,8 +90,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
         )
     output = scene.output
     if output.velocities is None:
-        can_store = bool(output.trajectory) and output.trajectory.endswith(WITH_VELOCITIES)
-        output = output.model_copy(update={"velocities": can_store})
+        output = output.model_copy(update={"velocities": output.can_store_velocities})
     tables = {
         "forces": scene.forces.model_copy(update=numbers | found.numbers),
         "output": output,
@@ -167,7 +166,7 @@ def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodySc
     output = {
         "interval_s": scene.output.interval_s or run.duration_s / SAMPLES,
         "trajectory_A_per_m": scale,
-        "topology": scene.output.topology or f"topology.{'pdb' if reach < FARTHEST_IN_PDB else 'gro'}",
+        "topology": scene.output.topology or (BODY_TOPOLOGY if reach < FARTHEST else TOPOLOGY),
     }
     if watch.orthogonality is None:
         watch = watch.model_copy(update={"orthogonality": ORTHOGONALITY_OF_SOLVERS if solver else ORTHOGONALITY})

@@ -17,7 +17,7 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
-from rigidmd.io.cells import right_angled
+from rigidmd.io.formats.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.io.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
-from rigidmd.io.cells import pairs_within
+from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
+from rigidmd.io.formats.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 

@@ -10,7 +10,7 @@ import numpy as np
 from rigidmd.assemble.species import sites_of_geometry
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import MoleculeError, StructureError
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene.models import Molecule, MoleculeFile, Site, find_site, molecule, read_parameters
 from rigidmd.scene.validation import ValidationError, validation_messages

@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.core.state import State
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.io.cells import pairs_within
+from rigidmd.io.formats.cells import pairs_within
 from rigidmd.scene.models import Molecule
 
 if TYPE_CHECKING:

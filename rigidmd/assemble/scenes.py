@@ -14,11 +14,11 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import RigidMDWarning, SceneError
-from rigidmd.io.ase_atoms import atoms_of_system
-from rigidmd.io.cells import cell_error
-from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS
+from rigidmd.io.formats import STRUCTURE
+from rigidmd.io.formats.cells import cell_error
+from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.molecules import STRUCTURE_NAME, Settings
+from rigidmd.scene.molecules import Settings
 from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def scene_from_atoms(
         raise SceneError(SOURCE, faults)
     has_momenta = atoms.has("momenta")
     draws = start.get("temperature_K") is not None
-    structure["file"] = STRUCTURE_NAME
+    structure["file"] = STRUCTURE
     structure.setdefault("velocities", has_momenta and not draws)
     if not atoms.pbc.any():
         box.setdefault("periodic", False)

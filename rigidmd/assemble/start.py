@@ -13,7 +13,7 @@ from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.fields.walls import range_of_centres
-from rigidmd.io.cells import cell_error
+from rigidmd.io.formats.cells import cell_error
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import AXES

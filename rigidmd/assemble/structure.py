@@ -12,8 +12,8 @@ from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.k_vectors import SAME_BASIS
-from rigidmd.io.atoms import SAME_MASS, Atoms
-from rigidmd.io.cells import (
+from rigidmd.io.formats.atoms import SAME_MASS, Atoms
+from rigidmd.io.formats.cells import (
     basis_of,
     cell_error,
     describe_basis,

@@ -39,22 +39,27 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
 
 
 @contextlib.contextmanager
+def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]:
+    """Within it an OSError becomes an OutputError: PATH cannot be `what`, the reason, and a hint."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path} cannot be {what}: {error.strerror or error}{hint}") from None
+
+
+@contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and removed when it fails.
 
     A link at `path` is replaced; its target is not changed.
     """
-    temporary = None
-    try:
-        created = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
-        created.touch(exist_ok=False)  # with the permissions of any new file
-        temporary = created
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
-    finally:
-        if temporary is not None:
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
+    with writing(path):
+        temporary.touch(exist_ok=False)  # with the permissions of any new file
+        try:
+            yield temporary
+            temporary.replace(path)
+        finally:
             temporary.unlink(missing_ok=True)
 
 
@@ -97,7 +102,7 @@ class AppendedFile:
     def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
         self._path = path
         self._size, self._sum = (0, 0) if kept is None else kept
-        with self._translated_errors("written" if kept is None else "read"):
+        with writing(path, "written" if kept is None else "read"):
             if kept is None:
                 create_empty_file(path)
             elif path.is_symlink() or (reason := unreadable_reason(path)):
@@ -112,20 +117,20 @@ class AppendedFile:
 
     def cut(self) -> None:
         """Remove everything that was appended after the time of `kept`."""
-        with self._translated_errors():
+        with writing(self._path):
             self._file.truncate(self._size)
             self._file.seek(self._size)
 
     @property
     def kept(self) -> tuple[int, int]:
         """Size in bytes, after flushing to the disk, and the CRC-32 of the appended records."""
-        with self._translated_errors():
+        with writing(self._path):
             os.fsync(self._file.fileno())
         return self._size, self._sum
 
     def append(self, piece: bytes) -> None:
         """Append a record."""
-        with self._translated_errors():
+        with writing(self._path):
             try:
                 self._write(piece)
             except OSError:
@@ -137,13 +142,13 @@ class AppendedFile:
 
     def patch(self, offset: int, piece: bytes) -> None:
         """Replace bytes at an offset."""
-        with self._translated_errors():
+        with writing(self._path):
             self._file.seek(offset)
             self._write(piece)
             self._file.seek(self._size)
 
     def close(self) -> None:
-        with self._translated_errors():
+        with writing(self._path):
             self._file.close()
 
     def _check(self, offset: int, first: bytes) -> None:
@@ -162,10 +167,3 @@ class AppendedFile:
         rest = memoryview(piece)
         while rest:
             rest = rest[self._file.write(rest) :]
-
-    @contextlib.contextmanager
-    def _translated_errors(self, done: str = "written") -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be {done}: {error.strerror}") from None

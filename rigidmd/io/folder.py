@@ -6,10 +6,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from rigidmd.core.files import is_temporary, unreadable_reason, write_text
+from rigidmd.core.files import is_temporary, unreadable_reason, write_text, writing
 from rigidmd.core.toml import shorten_text
 from rigidmd.errors import OutputError
-from rigidmd.io.write import writing
 
 #: Names of files of a run. The scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"

@@ -9,13 +9,13 @@ import tomli_w
 
 from rigidmd.core.files import atomic_file, write_text
 from rigidmd.io.folder import SCENE
+from rigidmd.io.formats import STRUCTURE
 from rigidmd.scene import Scene
-from rigidmd.scene.molecules import STRUCTURE_NAME
 
 
 def input_names(scene: Scene) -> dict[str, str]:
     """Names of the copies of a scene's input files: dotted key -> unique name. Copies of copies keep their names."""
-    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE_NAME)
+    names = {key: path.name for key, path in scene.inputs.items()} | dict.fromkeys(scene.embedded_files, STRUCTURE)
     starts = {key: f"input_{re.sub(r'[.](file|module|table)$|^molecules[.]', '', key)}_" for key in names}
     return {key: starts[key] + name.removeprefix(starts[key]) for key, name in names.items()}
 

@@ -4,7 +4,6 @@ import bz2
 import codecs
 import gzip
 import lzma
-import re
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -16,35 +15,16 @@ import numpy as np
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
-from rigidmd.io.formats.arc import read_arc, read_cssr
-from rigidmd.io.formats.gro import read_gro
-from rigidmd.io.formats.lammps import read_data, read_dump
-from rigidmd.io.formats.pdb import read_pdb
-from rigidmd.io.formats.through_ase import from_ase, read_by_ase, read_xyz
-from rigidmd.io.formats.trajectory_frames import read_trajectory
-from rigidmd.scene.start import LAMMPS_DATA, NAMELESS, TOPOLOGY_NAMES, TRAJECTORIES
+from rigidmd.io.formats import BY_CONTENT, TOPOLOGIES, Format, format_of
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
+from rigidmd.io.formats.through_ase import from_ase, read_by_ase
+from rigidmd.io.formats.through_mdanalysis import index_of, read_in_process
+from rigidmd.scene.validation import not_none
 
 FARTHEST = 1e9  # Å, of an atom from the origin
 HEAVIEST = 1e30  # u
 FOR_BYTE = 20  # bytes of memory per byte of a file, for lines and words as text, and numbers
 NO_VOLUME = 1e-9  # of a cell, relative to the cube of its longest edge
-ASE_TRAJECTORY = ".traj"
-#: Readers of text by extension. WITH_TYPES accept structure.atom_types.
-READERS: dict[str, Callable[..., list[Callable[[], Atoms]]]] = {
-    ".gro": read_gro, ".arc": read_arc, ".txyz": read_arc, ".cssr": read_cssr, ".pdb": read_pdb, ".ent": read_pdb,
-    ".xyz": read_xyz, ".extxyz": read_xyz, **dict.fromkeys(LAMMPS_DATA, read_data),
-}  # fmt: skip
-WITH_TYPES = (read_xyz, read_data, read_dump)
-NO_TYPES = "structure.atom_types is for formats whose atoms have types: LAMMPS' data files and dumps, .xyz"
-#: The begin of files whose extension is unknown, by reader.
-BEGINNINGS = (
-    (re.compile(r"\s*ITEM: (TIMESTEP|UNITS|TIME)\b"), read_dump),
-    (re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE), read_data),
-    (re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE), read_pdb),
-    (re.compile(r"\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"), read_xyz),
-    (re.compile(r".*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"), read_gro),
-)
 PACKED = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 BEGINNING = 1 << 16  # characters
 PIECE = 1 << 24  # bytes that are unpacked at a time
@@ -65,16 +45,9 @@ def read_atoms(
     """
     if content is None and (reason := unreadable_reason(path)):
         raise structure_error(path, reason)
-    suffix = path.suffix.lower()
-    if suffix in NAMELESS and topology is None:
-        missing = f"there is no {' or '.join(TOPOLOGY_NAMES)} next to it"
-        raise structure_error(path, f"holds no names of atoms, and {missing}: name a file by structure.topology")
-    if suffix in TRAJECTORIES and topology is None and atom_types is not None:
-        raise structure_error(path, NO_TYPES)
-    if suffix in TRAJECTORIES:
-        atoms = read_trajectory(
-            path, frame, None if topology is None else partial(read_atoms, topology, None, atom_types)
-        )
+    form = format_of(path)
+    if form is not None and form.is_trajectory:
+        atoms = _read_trajectory(path, form, -1 if frame is None else frame, atom_types, topology)
     else:
         size = path.stat().st_size if content is None else len(content)
         if shortage := memory_shortage(FOR_BYTE * size, f"reading its {format_gigabytes(size)}"):
@@ -84,7 +57,7 @@ def read_atoms(
     if len(atoms.position) == 0:
         raise structure_error(path, "holds no atoms")
     for what, values in (("position", atoms.position), ("velocity", atoms.velocity), ("cell", atoms.cell)):
-        if what == "velocity" and suffix not in TRAJECTORIES:
+        if what == "velocity" and not (form and form.is_trajectory):
             continue  # some atoms may have none
         if values is not None and not np.isfinite(values).all():
             bad = int(np.argmin(np.isfinite(values).all(axis=1)))
@@ -101,7 +74,7 @@ def read_atoms(
 
 
 def _without_placeholder(atoms: Atoms) -> Atoms:
-    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of .pdb and .cssr."""
+    """The atoms without a cell that stands for none: a cell of no volume, or the cube of 1 Å of PDB."""
     if atoms.cell is None:
         return atoms
     longest = np.linalg.norm(atoms.cell, axis=1).max()
@@ -113,6 +86,25 @@ def _without_placeholder(atoms: Atoms) -> Atoms:
     return atoms
 
 
+def _read_trajectory(path: Path, form: Format, frame: int, atom_types, topology: Path | None) -> Atoms:
+    """The atoms of a frame, with the names in the topology file if the format has none."""
+    if form.read_arrays is None:
+        if atom_types is not None:
+            raise structure_error(path, _no_types())
+        return not_none(form.read_frame)(path, frame)
+    if topology is None:
+        missing = f"there is no {' or '.join(TOPOLOGIES)} next to it"
+        raise structure_error(path, f"holds no names of atoms, and {missing}: name a file by structure.topology")
+    atoms = read_atoms(topology, None, atom_types)
+    found = read_in_process(form.read_arrays, path, frame, len(atoms.names))
+    return atoms._replace(position=found["position"], velocity=found.get("velocity"), cell=found.get("cell"))
+
+
+def _no_types() -> str:
+    names = [form.name or " ".join(form.extensions) for form in BY_CONTENT if form.has_types]
+    return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
+
+
 def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndarray]:
     """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one molecule."""
     from ase.data import atomic_masses, atomic_numbers
@@ -120,7 +112,7 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
     def mass(element: str) -> float:
         return HEAVY_HYDROGEN[element] if element in HEAVY_HYDROGEN else float(atomic_masses[atomic_numbers[element]])
 
-    if path.suffix.lower() in TRAJECTORIES:
+    if (form := format_of(path)) is not None and form.is_trajectory:
         raise structure_error(path, "is a trajectory: name a structure file, or write a frame of it as one")
     atoms = read_atoms(path)
     elements = [e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)]
@@ -129,7 +121,7 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
 
 
 def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) -> Callable[[], Atoms]:
-    if frame is None and path.suffix.lower() == ASE_TRAJECTORY:
+    if frame is None and (form := format_of(path)) is not None and form.read is None:
         frame = -1
     if frame is None:
         if len(frames) > 1:
@@ -140,36 +132,36 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
         frame = 1
     if not frames:
         raise structure_error(path, "holds no atoms")
-    if not 1 <= abs(frame) <= len(frames):
-        available = f"it holds {len(frames)}, 1 is the first and -1 the last"
-        raise structure_error(path, f"structure.frame is {frame}: {available}")
-    return frames[frame - 1 if frame > 0 else frame]
+    try:
+        return frames[index_of(len(frames), frame)]
+    except ValueError as error:
+        raise structure_error(path, str(error)) from None
 
 
 def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None) -> list[Callable[[], Atoms]]:
     """For each structure of a file, a function that reads it."""
     content = _content(path) if content is None else content
     name = Path(path.stem if path.suffix.lower() in PACKED else path.name)
-    suffix = name.suffix.lower()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     # Titles may have any encoding, data are ASCII. Windows begins files with a mark of the encoding.
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if not text.strip():
         raise structure_error(path, "holds no atoms: it is empty")
-    reader = READERS.get(suffix) or next((r for begin, r in BEGINNINGS if begin.search(text[:BEGINNING])), None)
-    if atom_types is not None and reader not in WITH_TYPES:
-        raise structure_error(path, NO_TYPES)
-    if reader is not None:
-        return reader(path, text.splitlines(), *([atom_types] if reader in WITH_TYPES else []))
+    form = format_of(name) or next(
+        (form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING])), None
+    )
+    if atom_types is not None and not (form and form.has_types):
+        raise structure_error(path, _no_types())
+    if form is not None and form.read is not None:
+        return form.read(path, text.splitlines(), *([atom_types] if form.has_types else []))
     with tempfile.TemporaryDirectory() as folder:
         source = path
         if name.name != path.name or wide or content.startswith(codecs.BOM_UTF8):
             source = Path(folder) / name.name
             source.write_bytes(text.encode() if wide else content.removeprefix(codecs.BOM_UTF8))
-        found = read_by_ase(path, source)
-    # the masses in ASE's trajectories, if they are not its standard ones
-    masses = [atoms.get_masses() if suffix == ASE_TRAJECTORY and atoms.has("masses") else None for atoms in found]
-    return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
+        if form is not None and form.read_packed is not None:
+            return form.read_packed(path, source)
+        return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, source)]
 
 
 def _content(path: Path) -> bytes:

@@ -1,49 +1,46 @@
-"""MDAnalysis Universes of runs, and reading of trajectories through MDAnalysis."""
+"""Trajectories and topologies of runs in files of any format, and as MDAnalysis Universes."""
 
 import contextlib
+import functools
 import re
+import struct
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import MDAnalysis as mda
 import numpy as np
-from MDAnalysis.coordinates.core import reader as open_reader
+from MDAnalysis.coordinates.base import ProtoReader, ReaderBase
+from MDAnalysis.coordinates.core import get_reader_for
+from MDAnalysis.coordinates.memory import MemoryReader
 from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
+from rigidmd.core.files import AppendedFile, atomic_file, writing
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
-from rigidmd.errors import OutputError, StructureError
-from rigidmd.io.atoms import Frame
-from rigidmd.io.bonds import charges, connections
+from rigidmd.errors import OutputError, SimulationError, StructureError
 from rigidmd.io.folder import offsets_of
-from rigidmd.io.formats.gsd import GsdReader
-from rigidmd.io.formats.trajectory_frames import read_in_process
-from rigidmd.io.mdanalysis_readers import FORMATS, TIMED, TimedFrames, dimensions
+from rigidmd.io.formats import BY_EXTENSION, written
+from rigidmd.io.formats.atoms import Frame
+from rigidmd.io.formats.bonds import charges, connections
+from rigidmd.io.formats.frame_file import FrameFile
+from rigidmd.io.formats.through_mdanalysis import dimensions, read_in_process, set_frame, universe_of
+from rigidmd.scene.validation import not_none
 
-#: Lines with the cell and the time of a frame in text formats.
-BETWEEN_FRAMES = {".xyz": rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)', ".pdb": rb"^REMARK +()TIME +(\S+) PS"}
 #: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
 EVEN = 1e-6
 
 
-def universe(system: System | BodySystem, state: State, velocities: bool = False, wrapped: bool = True) -> mda.Universe:
+def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
     """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this state."""
-    names = system.residue_names
-    u = mda.Universe.empty(
-        len(system.sites.molecule), n_residues=len(names), atom_resindex=system.sites.molecule, trajectory=True,
-        velocities=velocities,
-    )  # fmt: skip
-    sites = system.sites
-    attributes = {"names": sites.name, "types": sites.element, "elements": sites.element, "masses": sites.mass}
-    for name, values in (attributes | {"resnames": names, "resids": np.arange(1, len(names) + 1)}).items():
-        u.add_TopologyAttr(name, values)
+    u = universe_of(system)
     _connect(u, system, massless=False)  # viewers would draw these bonds
-    set_frame(u, system, state, 0.0, 0, velocities, wrapped)
+    set_frame(u, Frame(0.0, system.site_positions(state, wrapped), state.cell))
     return u
 
 
@@ -55,18 +52,6 @@ def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True
     u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system, massless).tolist()])
 
 
-def set_frame(
-    u: mda.Universe, system: System | BodySystem, state: State, time: float, step: int, velocities: bool, wrapped: bool
-):
-    frame = u.trajectory.ts
-    frame.positions = system.site_positions(state, wrapped)
-    if velocities:
-        frame.velocities = system.site_velocities(state)
-    frame.dimensions = dimensions(state.cell)
-    frame.time = time
-    frame.data["step"] = step
-
-
 def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
@@ -75,14 +60,14 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     boxes = [dimensions(frame.cell) for frame in frames if frame.cell is not None]
     boxes = None if u.dimensions is None else np.array(boxes)
     velocities = np.array([frame.velocities for frame in frames])
-    u.trajectory = TimedFrames(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
+    u.trajectory = timed(MemoryReader)(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
     return u
 
 
 def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
     """The Universe of a finished run's files, with these times (ps) of its frames, and elements, masses and bonds."""
     _drop_links(trajectory)
-    u = mda.Universe(str(topology), str(trajectory), format=TIMED[trajectory.suffix], times=_checked(times))
+    u = mda.Universe(str(topology), str(trajectory), format=timed(reader_of(trajectory.suffix)), times=_checked(times))
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
     _connect(u, system)
@@ -111,9 +96,9 @@ class Frames(NamedTuple):
 def read_frames(path: Path, sites: int, most: int) -> Frames:
     """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out. Raises OutputError if
     the file cannot be read, or has another number of sites."""
-    if path.suffix == ".xtc":  # a damaged file crashes the library of its reader
+    if (form := BY_EXTENSION[path.suffix]).check is not None:
         try:
-            read_in_process(path, 0, sites)
+            read_in_process(form.check, path, 0, sites)
         except StructureError as error:
             raise OutputError(str(error)) from None
     with _quiet():
@@ -126,8 +111,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 def _frames(path: Path, sites: int, most: int) -> Frames:
     _drop_links(path)
-    reader: Any = open_reader(str(path), format=FORMATS.get(path.suffix, path.suffix[1:]))
-    with contextlib.closing(reader):
+    with contextlib.closing(reader_of(path.suffix)(str(path))) as reader:
         if reader.n_atoms != sites:
             raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
         count, is_cut = reader.n_frames, False
@@ -162,8 +146,8 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
-    """Times (ps) and cells (3, 3) in lines between the frames of .xyz and .pdb, which MDAnalysis ignores."""
-    times, cells, pattern = [], [], BETWEEN_FRAMES.get(path.suffix)
+    """Times (ps) and cells (3, 3) in lines between the frames of a text, which MDAnalysis ignores."""
+    times, cells, pattern = [], [], BY_EXTENSION[path.suffix].times
     if pattern is None:
         return times, cells
     with path.open("rb") as file:
@@ -182,11 +166,11 @@ def _drop_links(path: Path) -> None:
             offsets.unlink()
 
 
-def read_rotations(path: Path) -> np.ndarray:
-    """Q of all molecules at all frames (frames, n, 3, 3) of a .gsd file. Raises OutputError if it cannot be read."""
+def read_exactly(path: Path) -> list[Frame]:
+    """All frames as the reader of their format in rigidmd has them. Raises OutputError if they cannot be read."""
     try:
-        with contextlib.closing(GsdReader(path)) as reader:
-            return np.array([reader.read(k).rotation() for k in range(reader.count)])
+        with contextlib.closing(not_none(BY_EXTENSION[path.suffix].reader)(path)) as reader:
+            return [reader.frame(k) for k in range(reader.count)]
     except (OSError, ValueError) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None
 
@@ -209,3 +193,164 @@ def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tupl
     pairs = self_capped_distance(at.astype(np.float32), distance, box=box, return_distances=False)
     vectors = (at[pairs[:, 1]] - at[pairs[:, 0]]).astype(np.float32)
     return pairs, vectors if box is None else minimize_vectors(vectors, box)
+
+
+class SiteReader(ReaderBase):
+    """MDAnalysis' reader of a format with a reader of rigidmd: `open_file`."""
+
+    units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
+    open_file: Callable[[Path], Any]
+
+    def __init__(self, filename, **options):
+        super().__init__(filename, **options)
+        self._reopen()
+        self.ts = self._Timestep(self.n_atoms, **self._ts_kwargs)
+        self._read_frame(0)
+
+    @property
+    def n_frames(self) -> int:
+        return self._file.count
+
+    def _reopen(self):
+        self.close()
+        self._file = self.open_file(Path(str(self.filename)))
+        self.n_atoms, self._frame = self._file.sites, -1
+
+    def close(self):
+        if hasattr(self, "_file"):
+            self._file.close()
+
+    def _read_frame(self, i):
+        if not 0 <= i < self.n_frames:
+            raise OSError(f"frame {i} does not exist")
+        found = self._file.frame(i)
+        if len(found.positions) != self.n_atoms:
+            raise ValueError(f"frame {i + 1} has another number of sites")
+        self._frame = self.ts.frame = i
+        self.ts.positions = found.positions
+        if found.velocities is not None:
+            self.ts.velocities = found.velocities
+        self.ts.dimensions = None if found.cell is None else dimensions(found.cell)
+        self.ts.time, self.ts.data["step"] = found.time, found.step
+        return self.ts
+
+    def _read_next_timestep(self, ts=None):
+        return self._read_frame(self._frame + 1)
+
+
+class _WithTimes(ProtoReader):
+    """Mixin for a reader that returns the times of the run (ps), evenly spaced or not, instead of those in the file."""
+
+    def __init__(self, *source, times: list[float], **options):
+        self._times = times
+        self._dt = float(times[1] - times[0]) if len(times) > 1 else 0.0
+        super().__init__(*source, **options | {"times": times})  # a reader passes its options to its copies
+        self._set_time(self.ts)
+
+    @property
+    def totaltime(self) -> float:
+        return self._times[-1] - self._times[0]
+
+    def _set_time(self, frame):
+        frame.time = self._times[frame.frame]
+        frame.dt = self._dt
+        return frame
+
+    def _read_frame(self, i):
+        return self._set_time(super()._read_frame(i))
+
+    def _read_next_timestep(self, ts=None):
+        # every reader implements it
+        return self._set_time(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
+
+
+@functools.cache
+def reader_of(extension: str) -> Any:
+    """MDAnalysis' class of readers of a format."""
+    form = BY_EXTENSION[extension]
+    if form.reader is None:
+        return get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+    return _named(f"SiteReader_{extension[1:]}", SiteReader, open_file=staticmethod(form.reader))
+
+
+@functools.cache
+def timed(reader: Any) -> Any:
+    """A subclass of a reader with the times of the run."""
+    return _named(f"Timed{reader.__name__}", _WithTimes, reader)
+
+
+def _named(name: str, *bases: Any, **attributes: Any) -> Any:
+    """A class as a name of this module, so that its readers can be pickled."""
+    globals()[name] = type(bases[-1])(name, bases, {"__module__": __name__, **attributes})
+    return globals()[name]
+
+
+def open_trajectory(
+    path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
+    kept: Sequence[int] | None = None
+) -> "TrajectoryFile | FrameFile":  # fmt: skip
+    """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
+    if (writer := BY_EXTENSION[path.suffix].writer) is not None:
+        if not isinstance(system, System):
+            raise TypeError(f"{path.suffix} files are for molecules only")
+        return writer(path, system, velocities, wrapped, kept)
+    return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
+
+
+def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
+    """Write names, molecules and first positions, which viewers need next to a trajectory. Raises SimulationError if
+    the format cannot hold a position."""
+
+    _check_fits(path, system.site_positions(state, wrapped))
+    with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
+        write = not_none(BY_EXTENSION[path.suffix].write_topology)
+        write(temporary, universe(system, state, wrapped).select_atoms("all"))
+
+
+def _check_fits(path: Path, positions: np.ndarray) -> None:
+    if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
+        others = " or ".join(written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even))
+        hint = f"use {others}, output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
+        raise SimulationError(f"a position is beyond the {bound:g} Å that {path.suffix} can hold: {hint}")
+
+
+class TrajectoryFile(AppendedFile):
+    """Writes frames to a trajectory, in the format of the file's extension.
+
+    The bytes of each frame are appended to the file. So every write is checked, a killed run leaves whole frames, and
+    a resumed run can continue the file.
+
+    interval : time between frames (ps), for formats that store it once for all frames
+    kept : earlier value of the property `kept`, from which `cut` continues the file; None begins a new file
+    Raises OutputError, here and in every method.
+    """
+
+    def __init__(
+        self, path: Path, system: System | BodySystem, interval: float, velocities: bool, wrapped: bool,
+        kept: Sequence[int] | None = None
+    ):  # fmt: skip
+        self._system, self._velocities, self._wrapped = system, velocities, wrapped
+        form = BY_EXTENSION[path.suffix]
+        self._encode: Any = not_none(form.encoder)(system, interval, velocities)
+        self._counter, self._count = form.counter[0], struct.Struct(form.counter[1])
+        *before, self._frames = kept or (0, 0, 0)
+        first = self._count.pack(1) if self._count.size else b""
+        super().__init__(path, before if kept else None, (self._counter, first))
+
+    @property
+    def kept(self) -> tuple[int, int, int]:
+        """Number of bytes, all on the disk, their checksum, and the number of frames."""
+        return *super().kept, self._frames
+
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        positions = self._system.site_positions(state, self._wrapped)
+        _check_fits(self._path, positions.astype(np.float32))
+        velocities = self._system.site_velocities(state) if self._velocities else None
+        cell = state.cell if np.isfinite(state.cell).all() else None
+        with writing(self._path):  # memory for the file of a frame may be insufficient
+            piece = self._encode(Frame(time, positions, cell, velocities, step=step), self._frames)
+        self.append(piece)
+        self._frames += 1
+        if self._count.size:
+            self.patch(self._counter, self._count.pack(self._frames))

@@ -3,8 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,6 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file, write_text
 from rigidmd.errors import OutputError
-
-
-@contextmanager
-def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]:
-    """Within it an OSError becomes an OutputError: PATH cannot be `what`, the reason, and a hint."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{path} cannot be {what}: {error.strerror or error}{hint}") from None
 
 
 def check_target(

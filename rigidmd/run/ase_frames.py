@@ -9,8 +9,9 @@ import numpy as np
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW
 from rigidmd.engines.system import System
-from rigidmd.io.ase_atoms import EV, atoms_of_sites, atoms_of_system
-from rigidmd.io.formats.traj import TrajReader
+from rigidmd.io.formats import format_of
+from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
+from rigidmd.io.trajectory import read_exactly
 from rigidmd.run.atom_forces import ase_results
 from rigidmd.units import KJ_PER_MOL
 
@@ -89,11 +90,10 @@ def _reader(results: "Results", system: System) -> Callable[[int], "ase.Atoms"]:
 
 def _from_files(results: "Results") -> Callable[[int], tuple]:
     """A function that reads positions, velocities and cell of frame k from the files."""
-    path = next((path for path in results.files if path.suffix == ".traj"), None)
-    if path is not None:
-        with contextlib.closing(TrajReader(path)) as file:
-            stored = [file.read(k) for k in range(file.count)]
-            return lambda k: (*file.of_sites(stored[k]), stored[k].cell)
+    for path in results.files:
+        if (form := format_of(path)) is not None and form.double:
+            frames = read_exactly(path)
+            return lambda k: frames[k].sites
     with ignore_warnings():  # frames that are not evenly spaced: each has its time
         trajectory = cast(Any, results.universe().trajectory)
 

@@ -25,7 +25,7 @@ from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
-from rigidmd.io.ase_atoms import EV
+from rigidmd.io.formats.through_ase import EV
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.scene.models import Molecule
 from rigidmd.units import BAR

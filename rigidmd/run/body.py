@@ -17,6 +17,7 @@ from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import Engine
 from rigidmd.errors import SimulationError
 from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.formats import format_of
 from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
@@ -130,8 +131,8 @@ class BodyRun(RunPart):
         self._sampler, self._watch = Sampler(interval), BodyWatch(self.simulation)
         files: list[Observer] = []
         if output.trajectory:
-            with_velocities = output.trajectory.endswith((".trr", ".nc"))
-            files = [Frames(interval, not_none(output.topology), output.trajectory, with_velocities)]
+            velocities = not_none(format_of(output.trajectory)).velocities
+            files = [Frames(interval, not_none(output.topology), output.trajectory, velocities)]
         if self.simulation.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
             files += [Figures()] if output.figures else []

@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from rigidmd.core.state import NOW, State
-from rigidmd.io.atoms import Frame
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
+from rigidmd.io.formats.atoms import Frame
 from rigidmd.run.resume import restored, stored
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ class Frames(GrowingFile):
         self._run = run
         if run.folder is None:
             return
-        from rigidmd.io.trajectory_writer import open_trajectory, write_topology  # MDAnalysis is slow to import
+        from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
 
         if self.kept is None:
             write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)

@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
+from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from rigidmd.engines.body_system import BodySystem
     from rigidmd.engines.samples import Samples
     from rigidmd.engines.system import System
-    from rigidmd.io.atoms import Frame
+    from rigidmd.io.formats.atoms import Frame
 
 
 @dataclass(repr=False)
@@ -142,12 +143,12 @@ class Results(Displayed):
             raise ValueError("this run has no frames (output.trajectory = false)")
         if self.files:
             path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
-            if path.suffix != ".gsd":
+            if not BY_EXTENSION[path.suffix].rotations:
                 from rigidmd.run.rigid_fit import RigidFit
 
                 fit = RigidFit(cast("System", self.system))
                 return np.array([fit.bodies(frame.positions, None).Q for frame in self.universe().trajectory])
-            from rigidmd.io.trajectory import read_rotations
+            from rigidmd.io.trajectory import read_exactly
 
-            return read_rotations(path)
+            return np.array([frame.rotation for frame in read_exactly(path)])
         return np.array([frame.rotation for frame in self._frames])

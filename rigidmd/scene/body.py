@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
+from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY, written
 from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates,
@@ -293,7 +294,7 @@ class BodyOutput(Section):
     """Time between samples in motion.csv and the trajectory; default: the duration divided by 2000"""
     npz: Flag = False
     """Also write motion.npz, the same columns as arrays"""
-    trajectory: str | Literal[False] = "trajectory.xtc"
+    trajectory: str | Literal[False] = TRAJECTORY
     """Trajectory of points of the body for viewers; the extension sets the format; false for none"""
     topology: str | None = None
     """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the edges of the body);
@@ -317,16 +318,16 @@ class BodyOutput(Section):
     @field_validator("trajectory")
     @classmethod
     def _trajectory_name(cls, name):
-        return name if name is False else file_name(name, (".xtc", ".trr", ".nc", ".xyz", ".pdb"))
+        return name if name is False else file_name(name, written(lambda form: form.encoder and not form.even))
 
     @field_validator("topology")
     @classmethod
     def _topology_name(cls, name: str | None):
-        return name if name is None else file_name(name, (".gro", ".pdb"))
+        return name if name is None else file_name(name, written(lambda form: form.write_topology))
 
     @model_validator(mode="after")
     def _files_differ(self):
-        if self.trajectory and self.trajectory in (self.topology, "topology.pdb" if self.topology is None else None):
+        if self.trajectory and self.trajectory == (self.topology or BODY_TOPOLOGY):
             raise ValueError(f"topology and trajectory are both {self.trajectory}; give them different names")
         if self.axis is not None and not any(self.axis):
             raise ValueError("axis is zero, which is not a direction")

@@ -9,6 +9,7 @@ from pydantic import Field, PrivateAttr, Strict, field_validator, model_validato
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
+from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -16,7 +17,7 @@ from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Molecules
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.start import NAMELESS, TOPOLOGY_NAMES, Box, Start, Structure
+from rigidmd.scene.start import Box, Start, Structure
 from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
 
 
@@ -96,12 +97,6 @@ class EngineChoice(Section):
         return f"OpenMM on its platform {self.platform or 'CPU'}" if self.name == "openmm" else self.name
 
 
-#: Name of the structure file of a scene made from `ase.Atoms`.
-STRUCTURE_NAME = "atoms.xyz"
-TRAJECTORY_FORMATS = (".xtc", ".trr", ".gsd", ".traj", ".dcd", ".nc", ".xyz", ".pdb")
-WITH_VELOCITIES = (".trr", ".nc", ".gsd", ".traj")
-TOPOLOGY_FORMATS = (".gro", ".pdb")
-
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
 Minutes = Interval | Literal[False]
 
@@ -124,12 +119,12 @@ class Output(Section):
     pressure_tensor_interval_ps: Interval | Literal[False] = False
     """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line needs an
     evaluation of forces with the virial"""
-    trajectory: str | Literal[False] = "trajectory.xtc"
+    trajectory: str | Literal[False] = TRAJECTORY
     """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd stores rotations
     and angular momenta, .traj is ASE's and has double precision; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
-    topology: str = "topology.gro"
+    topology: str = TOPOLOGY
     """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
     """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box. Molecules are whole in
@@ -144,23 +139,27 @@ class Output(Section):
     @field_validator("trajectory")
     @classmethod
     def _trajectory_name(cls, name):
-        return name if name is False else file_name(name, TRAJECTORY_FORMATS)
+        return name if name is False else file_name(name, written(lambda form: form.is_written))
 
     @field_validator("topology")
     @classmethod
     def _topology_name(cls, name: str):
-        return file_name(name, TOPOLOGY_FORMATS)
+        return file_name(name, written(lambda form: form.write_topology))
 
     @model_validator(mode="after")
     def _files_are_consistent(self):
-        if self.velocities and (self.trajectory is False or not self.trajectory.endswith(WITH_VELOCITIES)):
-            formats = f"use a {' or '.join(WITH_VELOCITIES)} file"
+        if self.velocities and not self.can_store_velocities:
+            formats = f"use a {' or '.join(written(lambda form: form.velocities))} file"
             raise ValueError(
                 f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; {formats}"
             )
         if self.topology == self.trajectory:
             raise ValueError(f"topology and trajectory are both {self.topology}; give them different names")
         return self
+
+    @property
+    def can_store_velocities(self) -> bool:
+        return bool(self.trajectory) and BY_EXTENSION[Path(self.trajectory).suffix].velocities
 
 
 class Settings(TypedDict, total=False):
@@ -284,9 +283,10 @@ class MolecularScene(Scene):
     def topology(self) -> str | None:
         """The topology file of a trajectory as structure: as given, or else as found in the trajectory's folder."""
         start = self.structure
-        if start is None or start.topology is not None or not start.file.lower().endswith(NAMELESS):
+        form = None if start is None else format_of(start.file)
+        if start is None or start.topology is not None or form is None or form.read_arrays is None:
             return None if start is None else start.topology
-        candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGY_NAMES]
+        candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
         return next((name for name in candidates if self.path(name).is_file()), None)
 
     def _errors(self):
@@ -361,23 +361,24 @@ class MolecularScene(Scene):
         ]
 
     def _uneven_frames(self) -> list[str]:
-        """Messages on stages with other intervals between frames: a DCD file has one interval for all frames."""
-        if not self.output.trajectory or not self.output.trajectory.endswith(".dcd"):
+        """Messages on stages with other intervals between frames, for a file with one interval for all frames."""
+        kind = Path(self.output.trajectory or "").suffix
+        if not kind or not BY_EXTENSION[kind].even:
             return []
-        wanted = self.output.trajectory_interval_ps
+        wanted, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
         faults = []
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
                 continue
             if stage.is_auto:
-                faults.append(f"output.trajectory: a .dcd file cannot follow the step of stages.{k}; use .xtc")
+                faults.append(f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}")
                 continue
             every = max(1, round(wanted * 1000 / stage.timestep_fs))
             uneven = stage.steps % every and k < len(self.stages) - 1
             if abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
                 faults.append(
-                    f"output.trajectory: a .dcd file stores one time between frames, and stages.{k} cannot keep "
-                    f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or use .xtc"
+                    f"output.trajectory: a {kind} file stores one time between frames, and stages.{k} cannot keep "
+                    f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
                 )
         return faults
 

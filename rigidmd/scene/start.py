@@ -6,16 +6,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
+from rigidmd.io.formats import extensions
 from rigidmd.scene.models import SiteName
 from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section
-
-#: Extensions of LAMMPS data files.
-LAMMPS_DATA = (".data", ".lmp", ".lammps")
-#: Extensions of trajectories without names of atoms, and of all trajectories.
-NAMELESS = (".xtc", ".trr", ".dcd", ".nc", ".ncdf")
-TRAJECTORIES = (*NAMELESS, ".gsd")
-#: Names of topology files that are found next to a trajectory, as in the folder of a run.
-TOPOLOGY_NAMES = ("topology.gro", "topology.pdb")
 
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]
 
@@ -24,8 +17,8 @@ class Structure(Section):
     """Positions at the start from a file."""
 
     file: Line
-    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), Tinker's .arc, .cssr, a trajectory (.xtc .trr
-    .gsd .traj .dcd .nc), or `final.npz` of an earlier run; in the folder of the scene or below"""
+    """File that ASE reads (.gro, .pdb, .xyz, .cif, LAMMPS' .data, ...), a trajectory (.xtc .trr .gsd .traj .dcd .nc),
+    or `final.npz` of an earlier run; in the folder of the scene or below"""
     topology: Line | None = None
     """Structure file with the names of the atoms, in the same order, for trajectories without names (all but .gsd).
     Default: topology.gro or topology.pdb in the folder of the trajectory"""
@@ -44,10 +37,14 @@ class Structure(Section):
 
     @model_validator(mode="after")
     def _needs_names(self):
-        if self.topology is not None and not self.file.lower().endswith(NAMELESS):
-            raise ValueError(f"topology is for trajectories without names ({' '.join(NAMELESS)}), not for {self.file}")
-        if self.topology is not None and self.topology.lower().endswith((*TRAJECTORIES, ".npz")):
-            raise ValueError(f"topology = {self.topology!r}: name a structure file with names of atoms (.gro, .pdb)")
+        if self.topology is None:
+            return self
+        nameless = extensions(lambda form: form.read_arrays)
+        if not self.file.lower().endswith(nameless):
+            raise ValueError(f"topology is for trajectories without names ({' '.join(nameless)}), not for {self.file}")
+        if self.topology.lower().endswith((*extensions(lambda form: form.is_trajectory), ".npz")):
+            with_names = ", ".join(extensions(lambda form: form.write_topology))
+            raise ValueError(f"topology = {self.topology!r}: name a structure file with names of atoms ({with_names})")
         return self
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidmd.assemble.build import build
+from rigidmd.core.files import writing
 from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView, force_field_of
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, SceneError
 from rigidmd.io.folder import SCENE, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
-from rigidmd.io.write import writing
 from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.molecules import EngineChoice

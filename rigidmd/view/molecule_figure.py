@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_figure, settings
-from rigidmd.io.bonds import COVALENT, bonds
+from rigidmd.io.formats.bonds import COVALENT, bonds
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import Molecule
 from rigidmd.view.molecule_text import short_source

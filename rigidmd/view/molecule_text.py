@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from rigidmd.io.bonds import _distance, bonds
+from rigidmd.io.formats.bonds import _distance, bonds
 from rigidmd.scene.models import GROUPS, Molecule
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 

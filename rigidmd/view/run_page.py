@@ -12,6 +12,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
 from rigidmd.io.folder import SCENE
+from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, section, table
@@ -198,10 +199,9 @@ def _files(record: Record) -> str:
     output, rows = record.scene.output, []
     about = ABOUT | {output.topology: "names and first positions, for viewers"}
     if output.trajectory:
-        viewers = {".gsd": "ovito", ".traj": "ase gui"}
-        viewer = viewers.get(Path(output.trajectory).suffix, f"vmd {output.topology}")
-        turns = " and rotations" if output.trajectory.endswith(".gsd") else ""
-        about[output.trajectory] = f"positions{turns} over time: {viewer} {output.trajectory}"
+        form = BY_EXTENSION[Path(output.trajectory).suffix]
+        viewer = form.viewer.format(topology=output.topology, trajectory=output.trajectory)
+        about[output.trajectory] = f"positions{' and rotations' if form.rotations else ''} over time: {viewer}"
     for path in sorted(record.folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue

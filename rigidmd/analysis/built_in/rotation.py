@@ -21,6 +21,7 @@ from rigidmd.analysis.result import (
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.errors import OutputError
+from rigidmd.io.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
 from rigidmd.run.rigid_fit import Kind
 
@@ -178,7 +179,8 @@ def spectrum(frames: RigidFrames) -> AnalysisResult:
     angular velocities, and their correlation functions. The integral over wave numbers is the number of degrees of
     freedom of a molecule. Needs frames with velocities, every few fs. Raises OutputError."""
     if frames.velocities is None or frames.L is None:
-        raise OutputError("a spectrum needs velocities in the frames: output.trajectory = 'trajectory.trr' has them")
+        kinds = " or ".join(written(lambda form: form.velocities))
+        raise OutputError(f"a spectrum needs velocities in the frames: a trajectory file of type {kinds} has them")
     interval, lags = interval_and_lags(frames, "a spectrum")
     size = len(frames) // BLOCKS
     found = AnalysisResult("spectrum", "densities of states")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.errors import EngineError
+from rigidmd.io.formats.lammps import box_in_bounds
 
 MAGIC = b"DUMPCUSTOM"
 
@@ -56,12 +57,3 @@ def read_dump(path: Path) -> Dump:
     low, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
     table = np.concatenate(rows)
     return Dump(step, low, cell, table[table[:, 0].argsort()])
-
-
-def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: float) -> tuple[np.ndarray, np.ndarray]:
-    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box."""
-    low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
-    high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
-    cell = np.diag(high - low)
-    cell[1, 0], cell[2, 0], cell[2, 1] = xy, xz, yz
-    return low, cell

@@ -1,1 +1,117 @@
-"""One module per file format, or per library that reads several formats."""
+"""File formats of structures and trajectories: each module here with `FORMATS` states everything about its formats.
+
+No other code of rigidmd names an extension. A module in this folder is found by being there; `register` adds a format
+from outside.
+"""
+
+import re
+from collections.abc import Callable
+from importlib import import_module
+from math import inf
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.io.formats.atoms import Atoms, Frame
+
+#: The system of a run, of a package above. All have `state`, `sites` with arrays `name`, `element`, `mass`, `molecule`,
+#: `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`. Those of molecules also have `species`,
+#: a `scene.models.Molecule` of each kind, `model.species`, `of_sites(function)` and `centres(state, wrapped)`.
+System = Any
+
+
+class Format(NamedTuple):
+    """A file format. What it cannot do is None or False."""
+
+    extensions: tuple[str, ...]  # in lower case; the first is written. None if it is known by its content only
+    name: str = ""  # in messages; default: its extensions
+
+    # As a structure. For each structure in a text `read` returns a function that returns its atoms; with `has_types`
+    # its last argument is structure.atom_types.
+    read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
+    content: re.Pattern[str] | None = None  # recognises the begin of a text whose extension is unknown
+    has_types: bool = False
+    read_packed: Callable[[Path, Path], list[Callable[[], Atoms]]] | None = None  # (path for messages, unpacked file)
+    # A frame of a trajectory, 1 for the first, -1 for the last. If the format has no names, `read_arrays` returns the
+    # position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a damaged file may crash it.
+    read_frame: Callable[[Path, int], Atoms] | None = None
+    read_arrays: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # (path, frame, number of atoms)
+
+    # As a trajectory. A format is written by `encoder`: (system, interval ps, whether with velocities) -> function of a
+    # frame and its index k that returns the bytes to append, for k = 0 with the head of the file. `counter` is the
+    # position and the `struct` format of the number of frames in the file. `writer` is a class for all other formats of
+    # molecules, see `frame_file.FrameFile`.
+    encoder: Callable[[Any, float, bool], Callable[[Frame, int], bytes]] | None = None
+    counter: tuple[int, str] = (0, "")
+    writer: Callable[..., Any] | None = None
+    # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only OSError and ValueError.
+    reader: Callable[[Path], Any] | None = None  # default: the reader of MDAnalysis
+    mdanalysis: str = ""  # its name in MDAnalysis, if that is not its extension
+    check: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # `count` of frames; in another process
+    times: re.Pattern[bytes] | None = None  # lines in a text of which MDAnalysis reads no (1) cell and no (2) time
+    velocities: bool = False  # what it can store
+    rotations: bool = False
+    double: bool = False  # numbers in double precision
+    even: bool = False  # only times at one interval
+    viewer: str = "vmd {topology} {trajectory}"  # the command that shows it
+
+    # As a topology: (path, atoms of MDAnalysis) with names and first positions.
+    write_topology: Callable[[Path, Any], None] | None = None
+    limits: tuple[float, float] = (-inf, inf)  # smallest and largest coordinate, Å
+
+    @property
+    def is_trajectory(self) -> bool:
+        """Whether single frames are read of it as structures."""
+        return self.read_frame is not None or self.read_arrays is not None
+
+    @property
+    def is_written(self) -> bool:
+        return self.encoder is not None or self.writer is not None
+
+    def exceeded(self, positions: np.ndarray) -> float | None:
+        """The limit, Å, beyond which a position (s, 3) is; None if the format can hold all of them."""
+        least, largest = self.limits
+        return least if positions.min() < least else largest if positions.max() > largest else None
+
+
+#: Formats by extension, and formats that are recognised by their content.
+BY_EXTENSION: dict[str, Format] = {}
+BY_CONTENT: list[Format] = []
+#: Default names of files of a run, of the topology of a body, with bonds, and of the `ase.Atoms` of a scene.
+TRAJECTORY, TOPOLOGY, BODY_TOPOLOGY, STRUCTURE = "trajectory.xtc", "topology.gro", "topology.pdb", "atoms.xyz"
+
+
+def register(form: Format) -> None:
+    """Add a format, in place of an earlier one with an extension of it."""
+    BY_EXTENSION.update(dict.fromkeys(form.extensions, form))
+    if form.content is not None and form not in BY_CONTENT:
+        BY_CONTENT.append(form)
+
+
+def find_modules() -> None:
+    """Register the formats of all modules in the folders of this package."""
+    for module in iter_modules(__path__, f"{__name__}."):
+        for form in getattr(import_module(module.name), "FORMATS", ()):
+            register(form)
+
+
+def format_of(path: str | Path) -> Format | None:
+    """The format of a file by its extension; None for one that only ASE may know, or nobody."""
+    return BY_EXTENSION.get(Path(path).suffix.lower())
+
+
+def extensions(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
+    """Sorted extensions of the formats for which `wanted` is true."""
+    return tuple(sorted(name for name, form in BY_EXTENSION.items() if wanted(form)))
+
+
+def written(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
+    """Of each of these formats only the extension that is written."""
+    return tuple(name for name in extensions(wanted) if name == BY_EXTENSION[name].extensions[0])
+
+
+find_modules()
+#: Names of topology files that are found next to a trajectory, as in the folder of a run.
+TOPOLOGIES = tuple(f"{Path(TOPOLOGY).stem}{name}" for name in written(lambda form: form.write_topology))

@@ -1,18 +1,22 @@
-"""Base of the trajectory files that are written by a library with a table of frames inside the file (GSD, ASE)."""
+"""Base of the trajectory files of molecules that a library writes with a table of frames inside the file (GSD, ASE)."""
 
+import contextlib
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from rigidmd.core.files import unreadable_reason
-from rigidmd.engines.system import System
+import numpy as np
+
+from rigidmd.core.files import atomic_file, create_empty_file, unreadable_reason
+from rigidmd.core.state import State
 from rigidmd.errors import OutputError
-from rigidmd.io.write import writing
+from rigidmd.io.formats import System
 
 
 class FrameFile(ABC):
-    """Writes frames to a file, each to the disk at once. See `TrajectoryFile` for the arguments.
+    """Writes frames to a file, each to the disk at once. For the arguments see `io.trajectory.TrajectoryFile`.
 
     The table of frames moves within a growing file. So a resumed run copies the frames up to the checkpoint to a new
     file, which has the same bytes as the file of a run without interruption.
@@ -25,39 +29,97 @@ class FrameFile(ABC):
         self._velocities, self._wrapped = velocities, wrapped
         self._sum, self._frames, self._kept = 0, 0, kept
         self._file: Any = None
+        self._begin()
+        if kept is None:
+            self._open_new()
+        elif kept[1]:
+            for _ in self._kept_frames():
+                pass
 
     @property
     def kept(self) -> tuple[int, int]:
         """Checksum and number of all frames, which are on the disk."""
         return self._sum, self._frames
 
+    def write(self, state: State, time: float, step: int) -> None:
+        """Add a frame with its own time (ps) and the box."""
+        frame = self._frame(state, time, step)
+        with self._writing():
+            self._append(self._file, frame)
+        self._count(frame)
+
+    def cut(self) -> None:
+        """Leave out the frames after the checkpoint."""
+        if not self._kept or not self._kept[1]:
+            self._open_new()
+            return
+        with self._writing():
+            with atomic_file(self._path) as temporary, contextlib.closing(self._open(temporary, "w")) as new:
+                for frame in self._kept_frames():
+                    self._append(new, frame)
+            self._file = self._open(self._path, "a")
+
     def close(self) -> None:
         if self._file is not None:
-            with writing(self._path):
+            with self._writing():
                 self._file.close()
+
+    def _open_new(self) -> None:
+        with self._writing():
+            create_empty_file(self._path)
+            self._file = self._open(self._path, "w")
 
     def _kept_frames(self) -> Iterator[Any]:
         """The frames up to the checkpoint. Raises OutputError if they have changed."""
-        self._sum, (kept_sum, self._frames) = 0, self._kept or (0, 0)
+        kept_sum, count = self._kept or (0, 0)
+        self._sum = self._frames = 0
         try:
             if reason := unreadable_reason(self._path):
                 raise ValueError(reason)
-            for frame in self._stored_frames(self._frames):
-                self._sum = self._summed(frame)
+            for frame in self._stored_frames(count):
                 yield frame
+                self._count(frame)
         except (ValueError, RuntimeError, KeyError, OSError) as error:
-            raise OutputError(f"{self._path} cannot be read to continue it: {reason_of(error)}") from None
+            raise OutputError(f"{self._path} cannot be read to continue it: {_reason(error)}") from None
         if self._sum != kept_sum:
             raise OutputError(f"{self._path} has changed or is damaged: its checksum is not that of what was written")
+
+    def _count(self, frame: Any) -> None:
+        self._frames += 1
+        for array in self._arrays(frame):
+            self._sum = zlib.crc32(np.ascontiguousarray(array).tobytes(), self._sum)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            raise OutputError(f"{self._path} cannot be written: {_reason(error)}") from None
+
+    @abstractmethod
+    @abstractmethod
+    def _begin(self) -> None:
+        """Set what is the same in all frames."""
+
+    @abstractmethod
+    def _open(self, path: Path, mode: str) -> Any:
+        """The file of the library, to write "w" or to append "a"."""
+
+    @abstractmethod
+    def _frame(self, state: State, time: float, step: int) -> Any:
+        """The frame of a state, as the library or `_append` takes it."""
+
+    @abstractmethod
+    def _append(self, file: Any, frame: Any) -> None: ...
+
+    @abstractmethod
+    def _arrays(self, frame: Any) -> Iterator[np.ndarray]:
+        """The arrays of a frame, for the checksum."""
 
     @abstractmethod
     def _stored_frames(self, count: int) -> Iterator[Any]:
         """The first frames of the file. Raises ValueError, RuntimeError, KeyError or OSError."""
 
-    @abstractmethod
-    def _summed(self, frame: Any) -> int:
-        """CRC-32 of the frames so far and this one."""
 
-
-def reason_of(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or " ".join(str(error).split())

@@ -1,15 +1,17 @@
-"""Reader of .gro. ASE reads neither more digits, nor several frames, nor velocities of some atoms only."""
+"""GRO, of GROMACS. ASE reads neither more digits, nor several frames, nor velocities of some atoms only."""
 
 import re
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.atoms import Atoms, structure_error
+from rigidmd.io.formats import Format
+from rigidmd.io.formats.atoms import Atoms, structure_error
 from rigidmd.io.formats.text import numbers, unexpected
 
 
@@ -64,3 +66,15 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     cell = 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     moving = None if np.isnan(velocity).all() else 10 * velocity
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
+
+
+def write_topology(path: Path, sites: Any) -> None:
+    sites.write(str(path))
+
+
+FORMATS = [
+    Format(
+        (".gro",), read=read_gro, write_topology=write_topology, limits=(-9999.9, 99999.9),  # columns of eight
+        content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
+    ),
+]  # fmt: skip

@@ -7,9 +7,8 @@ positions are unwrapped. Files are read chunk by chunk, and sizes are checked be
 """
 
 import contextlib
-import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -17,13 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file, create_empty_file
 from rigidmd.core.state import State
-from rigidmd.engines.system import System
-from rigidmd.errors import OutputError
-from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.io.bonds import charges, connections
-from rigidmd.io.formats.frame_file import FrameFile, reason_of
+from rigidmd.io.formats import Format
+from rigidmd.io.formats.atoms import Atoms, Frame, structure_error
+from rigidmd.io.formats.bonds import charges, connections
+from rigidmd.io.formats.frame_file import FrameFile
+from rigidmd.io.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
 
 #: Logged quantity with the time of a frame, ps, which the schema lacks.
@@ -124,6 +122,16 @@ class GsdReader:
             inertia=of("moment_inertia", (3,), 0).astype(float), mass=of("mass", (), 1).astype(float),
         )  # fmt: skip
 
+    def frame(self, k: int) -> Frame:
+        found = self.read(k)
+        where = found.position[found.sites]
+        return Frame(found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step)
+
+    @property
+    def sites(self) -> int:
+        """Number of sites in the first frame."""
+        return len(self.read(0).sites)
+
     def _chunk(self, frame: int, name: str) -> np.ndarray | None:
         """A chunk of a frame, else of the first frame (see the schema); None without either."""
         with _refusals():
@@ -197,35 +205,12 @@ MOMENTA = {"velocity": np.float32, "angmom": np.float32}
 
 
 class GsdFile(FrameFile):
-    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
-        super().__init__(path, system, velocities, wrapped, kept)
-        self._changing = POSITIONS | MOMENTA if velocities else POSITIONS
-        self._set_layout()
-        if kept is not None:
-            for _ in self._kept_frames():
-                pass
-            return
-        with _writing(path):
-            create_empty_file(path)
-            self._file = _open(path, "w")
+    def _open(self, path: Path, mode: str) -> Any:
+        import gsd.hoomd  # slow to import
 
-    def write(self, state: State, time: float, step: int) -> None:
-        """Add a frame with its own time (ps) and the box."""
-        frame = self._frame(state, time, step)
-        with _writing(self._path):
-            self._append(self._file, frame)
-        self._sum, self._frames = self._summed(frame), self._frames + 1
+        return gsd.hoomd.open(str(path), "r+" if mode == "a" else mode)  # pyright: ignore[reportArgumentType]
 
-    def cut(self) -> None:
-        """Leave out the frames after the checkpoint."""
-        with _writing(self._path):
-            with atomic_file(self._path) as temporary, _open(temporary, "w") as new:
-                for frame in self._kept_frames():
-                    self._append(new, frame)
-            self._file = _open(self._path, "r+")
-
-    @staticmethod
-    def _append(file: Any, frame: Any) -> None:
+    def _append(self, file: Any, frame: Any) -> None:
         file.append(frame)
         file.file.flush()  # after every frame, so that offsets of chunks do not depend on the time of a flush
 
@@ -234,12 +219,13 @@ class GsdFile(FrameFile):
             particles = len(self._constant["mass"])
             if reader.count < count or not {reader.size(k) for k in range(count)} <= {particles}:
                 raise ValueError(f"{count} frames of {particles} particles are needed")
-        with _open(self._path, "r") as old:
+        with self._open(self._path, "r") as old:
             for k in range(count):
                 yield old[k]
 
-    def _set_layout(self) -> None:
+    def _begin(self) -> None:
         """Set the constant properties. Particles are molecules, then the sites of molecules with several sites."""
+        self._changing = POSITIONS | MOMENTA if self._velocities else POSITIONS
         system = self._system
         molecule, species = system.sites.molecule, system.model.species
         single = np.bincount(molecule) == 1
@@ -268,10 +254,13 @@ class GsdFile(FrameFile):
 
     def _labels(self) -> np.ndarray:
         """Type of each site (s,): its element, or its name without element, with the species if it is ambiguous."""
-        names, of_scene, of_species = [], defaultdict(set), defaultdict(set)
+        of_scene, of_species = defaultdict(set), defaultdict(set)
+
+        def names_of(m: Any) -> list[str]:
+            return [name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)]
+
         for m in self._system.species:
-            names.append([name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)])
-            for name, *kind in zip(names[-1], m.masses, m.charges, m.sigma, m.epsilon, strict=True):
+            for name, *kind in zip(names_of(m), m.masses, m.charges, m.sigma, m.epsilon, strict=True):
                 of_scene[name].add(tuple(kind))
                 of_species[m.name, name].add(tuple(kind))
 
@@ -280,11 +269,10 @@ class GsdFile(FrameFile):
                 return name
             return f"{species}.{name if len(of_species[species, name]) == 1 else site}"
 
-        labels = []
-        for m, of_sites in zip(self._system.species, names, strict=True):
-            pairs = zip(of_sites, m.site_names, strict=True)
-            labels.append(np.array([label(m.name, *pair) for pair in pairs], dtype=object))
-        return gather_per_molecule(labels, self._system.model.species)
+        def labels(m: Any) -> np.ndarray:
+            return np.array([label(m.name, *names) for names in zip(names_of(m), m.site_names, strict=True)], object)
+
+        return self._system.of_sites(labels)
 
     def _frame(self, state: State, time: float, step: int) -> Any:
         system, sites = self._system, self._constituent
@@ -318,26 +306,11 @@ class GsdFile(FrameFile):
             frame.bonds.typeid = np.zeros(len(self._bonds), int)
         return frame
 
-    def _summed(self, frame: Any) -> int:
-        found = zlib.crc32(np.asarray(frame.configuration.box, np.float32).tobytes(), self._sum)
-        found = zlib.crc32(np.asarray(frame.log[TIME], float).tobytes(), found)
+    def _arrays(self, frame: Any) -> Iterator[np.ndarray]:
+        yield np.asarray(frame.configuration.box, np.float32)
+        yield np.asarray(frame.log[TIME], float)
         for name, kind in self._changing.items():
-            found = zlib.crc32(np.ascontiguousarray(getattr(frame.particles, name), kind).tobytes(), found)
-        return found
-
-
-def _open(path: Path, mode: Any) -> Any:
-    import gsd.hoomd  # slow to import
-
-    return gsd.hoomd.open(str(path), mode)
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"{path} cannot be written: {reason_of(error)}") from None
+            yield np.asarray(getattr(frame.particles, name), kind)
 
 
 def _inside(cell: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -346,3 +319,25 @@ def _inside(cell: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndar
         return position, np.zeros(position.shape, np.int32)
     image = np.floor(np.linalg.solve(cell.T, position.T).T)
     return position - (image + 0.5) @ cell, image.astype(np.int32)
+
+
+def read_frame(path: Path, frame: int) -> Atoms:
+    try:
+        with contextlib.closing(GsdReader(path)) as reader:
+            found = reader.read(index_of(reader.count, frame))
+    except (OSError, ValueError) as error:
+        raise structure_error(path, f"cannot be read as a trajectory: {error}") from None
+    sites = found.sites
+    names = [found.label[site].rsplit(".", 1)[-1] for site in sites]  # a type may be species.name
+    return Atoms(
+        names, [""] * len(names), [(int(owner) + 1, found.label[owner]) for owner in found.owner[sites]],
+        found.position[sites], found.site_velocities(), found.cell,
+    )  # fmt: skip
+
+
+FORMATS = [
+    Format(
+        (".gsd",), read_frame=read_frame, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
+        viewer="ovito {trajectory}",
+    ),
+]  # fmt: skip

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.engines.lammps.dump import box_in_bounds
 from rigidmd.errors import StructureError
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element, structure_error
+from rigidmd.io.formats import Format
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element, structure_error
 from rigidmd.io.formats.text import atom_count, numbers, table, unexpected
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
@@ -292,3 +292,24 @@ def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -
     if general:
         return bounds[:, 3], bounds[:, :3]
     return box_in_bounds(bounds[:, 0], bounds[:, 1], *(bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)))
+
+
+def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: float) -> tuple[np.ndarray, np.ndarray]:
+    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box."""
+    low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
+    high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
+    cell = np.diag(high - low)
+    cell[1, 0], cell[2, 0], cell[2, 1] = xy, xz, yz
+    return low, cell
+
+
+FORMATS = [
+    Format(
+        (".data", ".lmp", ".lammps"), "data files of LAMMPS (.data)", read=read_data, has_types=True,
+        content=re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE),
+    ),
+    Format(
+        (), "dumps of LAMMPS", read=read_dump, has_types=True,
+        content=re.compile(r"\A\s*ITEM: (TIMESTEP|UNITS|TIME)\b"),
+    ),
+]  # fmt: skip

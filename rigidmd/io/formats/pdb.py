@@ -1,4 +1,4 @@
-"""Reader of .pdb. ASE reads neither numbers wider than their columns nor a CRYST1 that stands for no cell."""
+"""PDB. ASE reads neither numbers wider than their columns nor a CRYST1 that stands for no cell."""
 
 import contextlib
 import re
@@ -6,11 +6,15 @@ from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
-from rigidmd.io.formats.text import cell_of, numbers, unexpected
+from rigidmd.io.formats import Format, System
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.cells import cell_of
+from rigidmd.io.formats.text import numbers, unexpected
+from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
@@ -87,3 +91,37 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     if not (found := found or FREE.match(line, 26 + moved)):
         raise unexpected(path, number, "an atom of a .pdb with coordinates in columns 31 to 54", line[26:60])
     return straight, found.end(), numbers(path, number, list(found.groups()), "three coordinates")
+
+
+def encoder(system: System, interval: float, velocities: bool) -> Callable[[Frame, int], bytes]:
+    """Models, each with its time in a remark and its box before it; bonds are in the topology."""
+    files = FrameFiles(system, velocities, "PDB", {"multiframe": True, "bonds": None})
+
+    def encode(frame: Frame, k: int) -> bytes:
+        def write(writer, atoms):
+            writer.REMARK(f"TIME {frame.time:.6f} PS")
+            writer.write(atoms)
+            if box := dimensions(frame.cell):
+                writer.CRYST1(box)
+
+        # without END, which readers count as a further frame
+        lines = files.content(frame, write, start=k).removesuffix(b"END\n").splitlines(keepends=True)
+        model = next(i for i, line in enumerate(lines) if line.startswith(b"MODEL "))
+        box = [line for line in lines[-1:] if line.startswith(b"CRYST1")]
+        head = [line for line in lines[: 1 if k else model] if not line.startswith(b"CRYST1")]
+        return b"".join([*head, *box, *lines[model : len(lines) - len(box)]])
+
+    return encode
+
+
+def write_topology(path: Path, sites: Any) -> None:
+    sites.write(str(path), bonds="all")
+
+
+FORMATS = [
+    Format(
+        (".pdb", ".ent"), read=read_pdb, encoder=encoder, times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
+        content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
+        write_topology=write_topology, limits=(-999.99, 9999.99),  # columns of eight
+    ),
+]  # fmt: skip

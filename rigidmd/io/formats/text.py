@@ -1,6 +1,5 @@
-"""Helpers for readers of text formats: numbers, tables and cells, with the line of each error."""
+"""Helpers for readers of text formats: numbers and tables, with the line of each error."""
 
-import contextlib
 import re
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
-from rigidmd.io.atoms import structure_error
+from rigidmd.io.formats.atoms import structure_error
 
 
 def unexpected(path: Path, line: int, what: str, found: str) -> StructureError:
@@ -49,21 +48,3 @@ def table(path: Path, rows: list[tuple[int, list[str]]], what: str) -> np.ndarra
             if len(values) != len(found[0]) or not values:
                 raise unexpected(path, line, what, " ".join(words)) from None
         return np.array(found)
-
-
-def cell_of(edges_and_angles: list[float]) -> np.ndarray | None:
-    """The cell (3, 3) with these edges and angles; None if no cell has them."""
-    from ase.geometry import cellpar_to_cell
-
-    edges, angles = np.array(edges_and_angles).reshape(2, 3)
-    if np.isfinite(edges).all() and (edges > 0).all() and (angles > 0).all() and (angles < 180).all():
-        with contextlib.suppress(AssertionError):  # raised by ASE if three edges cannot form the angles
-            return cellpar_to_cell([*edges, *angles])
-    return None
-
-
-def required_cell(path: Path, edges_and_angles: list[float]) -> np.ndarray:
-    if (cell := cell_of(edges_and_angles)) is not None:
-        return cell
-    values = " ".join(f"{x:g}" for x in edges_and_angles)
-    raise structure_error(path, f"no cell has its edges and angles, {values}")

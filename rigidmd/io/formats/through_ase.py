@@ -1,21 +1,22 @@
-"""Structure files read through ASE, with corrections before and after for .xyz."""
+"""Structures from and for ASE: files that it reads, and `ase.Atoms` with the sites that have mass, in ASE's units."""
 
 import io
-import re
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from rigidmd.core.process import ignore_warnings
-from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
-from rigidmd.io.formats.text import atom_count, numbers, without_fortran
+from rigidmd.core.state import NOW, State
+from rigidmd.io.formats import System, extensions
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
+from rigidmd.units import ENERGY_UNITS
 
 if TYPE_CHECKING:
+    import ase
     from ase import Atoms as AseAtoms
+
+EV = ENERGY_UNITS["eV"]
 
 #: ASE's unit of velocity, sqrt(eV/u), in Å/ps.
 ASE_VELOCITY = 98.22694788464063
@@ -33,8 +34,8 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         with ignore_warnings():
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
-        known = ".gro, .pdb, .xyz, .cif and LAMMPS' .data are among the known formats"
-        raise structure_error(path, f"its format is unknown to ASE; {known}") from None
+        known = " ".join(extensions(lambda form: form.read or form.read_packed))
+        raise structure_error(path, f"its format is unknown to ASE; known here are {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
         reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
         hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
@@ -74,75 +75,32 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
     )  # fmt: skip
 
 
-def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
-    """The frames of a plain or extended .xyz through ASE, which needs elements, while many files have names.
-    `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
-    labels, clean, at = [], [], 0
-    while at < len(lines):
-        if not lines[at].strip():
-            at += 1
-            continue
-        count = atom_count(path, at + 1, lines[at].strip(), len(lines) - at - 2)
-        clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
-        properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
-        column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
-        what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
-        lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
-        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
-            raise structure_error(path, f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}")
-        for k in range(at + 2, at + 2 + count):
-            words = lines[k].split()
-            if len(words) < width:
-                raise structure_error(path, f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}")
-            if place is not None:
-                numbers(path, k + 1, words[place : place + 3], what)
-            words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
-            labels.append(None)
-            if column is not None:
-                labels[-1] = _label(words[column], atom_types)
-                _, symbol = labels[-1]
-                words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
-            clean.append(" ".join(words))
-        at += 2 + count
-    frames, first = [], 0
-    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []:
-        of_frame = labels[first : first + len(atoms)]
-        first += len(atoms)
-        named = len(of_frame) == len(atoms) and None not in of_frame
-        names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
-        if NAMES in atoms.arrays:
-            names = [str(name) for name in atoms.arrays[NAMES]]
-        masses = atoms.get_masses() if atoms.has("masses") else None
-        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms), masses))
-    return frames
+def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase.Atoms":
+    """A state of a system as an `ase.Atoms`, see `atoms_of_sites`."""
+    return atoms_of_sites(
+        system, system.site_positions(state, wrapped), system.site_velocities(state), state.cell, float(state.time[NOW])
+    )
 
 
-def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
-    """Name and element of an atom. The name in the file may be that of a type, or an atomic number."""
-    from ase.data import chemical_symbols
+def atoms_of_sites(
+    system: System, positions: np.ndarray, velocities: np.ndarray | None, cell: np.ndarray | None, time: float
+) -> "ase.Atoms":
+    """The sites with mass as an `ase.Atoms`, with masses, names and residues of the models, and `info["time_ps"]`, from
+    positions and velocities (s, 3) of all sites, Å and Å/ps, and a cell (3, 3), None or infinite without a box."""
+    import ase
 
-    name = (atom_types or {}).get(name, name)
-    if (number := parse_whole_number(name)) is not None and 0 < number < len(chemical_symbols):
-        name = chemical_symbols[number]
-    symbol = name.capitalize()
-    return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
-
-
-def _residues(atoms) -> list[tuple] | None:
-    """Residues from ASE's arrays of them; None without."""
-    if not {RESIDUE_NAMES, RESIDUE_NUMBERS} <= set(atoms.arrays):
-        return None
-    numbers = atoms.arrays[RESIDUE_NUMBERS]
-    if numbers.dtype.kind != "i":
-        return None
-    return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
-
-
-def _columns(properties: str) -> tuple[int | None, int | None, int]:
-    """Columns of the species and of the positions, or None, and the number of columns: 0, 1 and 4 for
-    `species:S:1:pos:R:3`."""
-    words, column, found = properties.split(":"), 0, {}
-    for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
-        found["species" if name.lower() == "symbols" else name.lower()] = column
-        column += 1 if (columns := parse_whole_number(width)) is None else columns
-    return found.get("species"), found.get("pos"), column
+    sites = system.sites
+    atom = np.flatnonzero(sites.mass > 0)
+    symbols = ["H" if e in HEAVY_HYDROGEN else e if is_element(e) else "X" for e in sites.element[atom]]
+    boxed = cell is not None and bool(np.isfinite(cell).all())
+    found = ase.Atoms(
+        symbols, positions=np.asarray(positions, float)[atom], masses=sites.mass[atom], cell=cell if boxed else None,
+        pbc=boxed, info={"time_ps": time},
+    )  # fmt: skip
+    if velocities is not None:
+        found.set_velocities(np.asarray(velocities, float)[atom] / ASE_VELOCITY)
+    of_atom = sites.molecule[atom]
+    found.set_array(NAMES, sites.name[atom].astype(str))
+    found.set_array(RESIDUE_NAMES, system.residue_names[of_atom].astype(str))
+    found.set_array(RESIDUE_NUMBERS, system.residue_number[of_atom].astype(int))
+    return found

@@ -6,20 +6,18 @@ item by item, and sizes are checked before arrays are allocated.
 
 import contextlib
 import os
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file, create_empty_file
 from rigidmd.core.state import State
-from rigidmd.engines.system import System
-from rigidmd.io.ase_atoms import atoms_of_sites
+from rigidmd.io.formats import Format
+from rigidmd.io.formats.atoms import Atoms, Frame
 from rigidmd.io.formats.frame_file import FrameFile
-from rigidmd.io.formats.through_ase import ASE_VELOCITY
-from rigidmd.io.write import writing
+from rigidmd.io.formats.through_ase import ASE_VELOCITY, atoms_of_sites, from_ase, read_by_ase
 
 TAG = "ASE-Trajectory"
 #: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities of the other sites.
@@ -92,12 +90,12 @@ class TrajReader:
         except (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
-    def of_sites(self, frame: Stored) -> tuple[np.ndarray, np.ndarray | None]:
-        """Positions (s, 3), Å, and velocities (s, 3), Å/ps, of all sites in the order of the scene."""
-        positions = self._joined(frame.positions, frame.massless)
-        if frame.momenta is None:
-            return positions, None
-        return positions, self._joined(frame.momenta / self._mass[:, None] * ASE_VELOCITY, frame.massless_velocity)
+    def frame(self, k: int) -> Frame:
+        found = self.read(k)
+        positions, velocities = self._joined(found.positions, found.massless), None
+        if found.momenta is not None:
+            velocities = self._joined(found.momenta / self._mass[:, None] * ASE_VELOCITY, found.massless_velocity)
+        return Frame(found.time, positions, found.cell, velocities, step=found.step)
 
     def _joined(self, of_atoms: np.ndarray, others: np.ndarray | None) -> np.ndarray:
         found = np.empty((self.sites, 3))
@@ -124,57 +122,31 @@ class TrajReader:
 class TrajFile(FrameFile):
     """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and `ase.io.read`."""
 
-    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
-        super().__init__(path, system, velocities, wrapped, kept)
+    def _begin(self) -> None:
+        system = self._system
         self._massive = np.flatnonzero(system.sites.mass > 0)
         self._massless = np.flatnonzero(system.sites.mass == 0)
         # its symbols, masses and periodicity are the same in every frame
         self._template = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
-        if kept is None:
-            self._begin()
-        elif kept[1]:
-            for _ in self._kept_frames():
-                pass
-
-    def _begin(self) -> None:
-        with writing(self._path):
-            create_empty_file(self._path)
-            self._file = _open(self._path, "w")
-
-    def cut(self) -> None:
-        """Leave out the frames after the checkpoint."""
-        if not self._kept or not self._kept[1]:
-            self._begin()
-            return
-        with atomic_file(self._path) as temporary, contextlib.closing(_open(temporary, "w")) as new:
-            for frame in self._kept_frames():
-                self._append(new, frame)
-        with writing(self._path):
-            self._file = _open(self._path, "a")
 
     @property
     def kept(self) -> tuple[int, int]:
-        with writing(self._path):
+        with self._writing():
             os.fsync(self._file.backend.fd.fileno())
         return super().kept
 
-    def write(self, state: State, time: float, step: int) -> None:
-        """Add a frame with its own time (ps) and the box."""
+    def _frame(self, state: State, time: float, step: int) -> Stored:
         system = self._system
         position = system.site_positions(state, self._wrapped)
         cell = state.cell if np.isfinite(state.cell).all() else None
-        found = Stored(position[self._massive], None, None, None, cell, float(time), int(step))
-        if len(self._massless):
-            found = found._replace(massless=position[self._massless])
+        momenta = others = of_others = None
         if self._velocities:
             velocity = system.site_velocities(state)
-            moving = atoms_of_sites(system, position, velocity, state.cell, time)
-            found = found._replace(momenta=moving.get_momenta())
-            if len(self._massless):
-                found = found._replace(massless_velocity=velocity[self._massless])
-        with writing(self._path):
-            self._append(self._file, found)
-            self._sum, self._frames = self._summed(found), self._frames + 1
+            momenta = atoms_of_sites(system, position, velocity, state.cell, time).get_momenta()
+        if len(self._massless):
+            others = position[self._massless]
+            of_others = velocity[self._massless] if self._velocities else None
+        return Stored(position[self._massive], momenta, others, of_others, cell, float(time), int(step))
 
     def _append(self, file: Any, frame: Stored) -> None:
         atoms = self._template
@@ -198,15 +170,26 @@ class TrajFile(FrameFile):
             for k in range(count):
                 yield old.read(k)
 
-    def _summed(self, frame: Stored) -> int:
-        found = self._sum
-        for part in (*frame[:5], np.array([frame.time, float(frame.step)])):
-            if part is not None:
-                found = zlib.crc32(np.ascontiguousarray(part, float).tobytes(), found)
-        return found
+    def _arrays(self, frame: Stored) -> Iterator[np.ndarray]:
+        yield from (np.asarray(part, float) for part in frame[:5] if part is not None)
+        yield np.array([frame.time, float(frame.step)])
+
+    def _open(self, path: Path, mode: str) -> Any:
+        from ase.io.trajectory import TrajectoryWriter  # slow to import
+
+        return TrajectoryWriter(path, mode)
 
 
-def _open(path: Path, mode: str) -> Any:
-    from ase.io.trajectory import TrajectoryWriter  # slow to import
+def read_packed(path: Path, source: Path) -> list[Callable[[], Atoms]]:
+    """The frames of any .traj of ASE, with masses that are not its standard ones."""
+    found = read_by_ase(path, source)
+    masses = [atoms.get_masses() if atoms.has("masses") else None for atoms in found]
+    return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
 
-    return TrajectoryWriter(path, mode)
+
+FORMATS = [
+    Format(
+        (".traj",), read_packed=read_packed, writer=TrajFile, reader=TrajReader, velocities=True, double=True,
+        viewer="ase gui {trajectory}",
+    ),
+]  # fmt: skip

@@ -11,10 +11,11 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from rigidmd.core.files import writing
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
-from rigidmd.io.write import write_json, writing
+from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"

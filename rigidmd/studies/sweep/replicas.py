@@ -9,11 +9,12 @@ import numpy as np
 
 from rigidmd.analysis.files import AnalysisRequest, analyse_folder, describe_range, write_results
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
+from rigidmd.core.files import writing
 from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.table import Column, Table, with_error
-from rigidmd.io.write import nine_digits, writing
+from rigidmd.io.write import nine_digits
 from rigidmd.studies.sweep.folder import FINISHED, Manifest, SweepPoint, read_manifest, state_on_disk
 from rigidmd.studies.sweep.table import key_columns
 

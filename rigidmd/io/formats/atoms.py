@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,13 +65,14 @@ def element_of_mass(mass: float) -> str:
 
 
 class Frame(NamedTuple):
-    """A frame of a run in memory. If a trajectory file is written, only its time is kept."""
+    """A frame of a trajectory. If a run writes a file, it keeps only the times of frames in memory."""
 
     time: float  # ps
-    positions: np.ndarray | None = None  # (s, 3) sites, Å
-    cell: np.ndarray | None = None  # (3, 3) Å
+    positions: Any = None  # (s, 3) sites, Å
+    cell: np.ndarray | None = None  # (3, 3) Å; None without a box
     velocities: np.ndarray | None = None  # (s, 3) sites, Å/ps
     rotation: np.ndarray | None = None  # (n, 3, 3) molecules
+    step: int = 0
 
     @property
     def sites(self) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:

@@ -1,32 +1,30 @@
-"""Bonds for viewers and topology files: those of molecules, and the edges between the points of a single body."""
+"""Bonds for viewers and topology files: those of molecules, and the edges between the points of a single body.
+
+A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a `scene.models.Molecule`.
+"""
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
-
-from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.system import System
-from rigidmd.scene.models import Molecule
 
 #: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the size below which
 #: points lie in a plane or on a line.
 FLAT, THIN = 1e-6, 1e-9
 
 
-def connections(system: System | BodySystem, massless: bool = False) -> np.ndarray:
+def connections(system: Any, massless: bool = False) -> np.ndarray:
     """Pairs (b, 2) of sites that are joined. `massless`: whether massless sites are joined to their nearest atoms, so
     that each molecule is connected."""
-    return _edges_of_body(system) if isinstance(system, BodySystem) else _bonds_of_molecules(system, massless)
+    return _bonds_of_molecules(system, massless) if hasattr(system, "species") else _edges_of_body(system)
 
 
-def charges(system: System | BodySystem) -> np.ndarray:
+def charges(system: Any) -> np.ndarray:
     """Charges (s,) of all sites, e; 0 for a single body."""
-    if isinstance(system, BodySystem):
-        return np.zeros(len(system.points))
-    return np.concatenate([system.species[kind].charges for kind in system.model.species])
+    return system.of_sites(lambda m: m.charges) if hasattr(system, "species") else np.zeros(len(system.points))
 
 
-def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
+def _bonds_of_molecules(system: Any, massless: bool) -> np.ndarray:
     starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
     links = [
         np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species
@@ -34,7 +32,7 @@ def _bonds_of_molecules(system: System, massless: bool) -> np.ndarray:
     return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
 
 
-def _edges_of_body(system: BodySystem) -> np.ndarray:
+def _edges_of_body(system: Any) -> np.ndarray:
     """Edges of the hull of a solid, or the shortest links between points. A pinned body is linked to the pivot."""
     first = 0 if system.translates else 1  # the pivot is the first point
     points = system.points[first:]
@@ -85,7 +83,7 @@ COVALENT = {"H": 0.31, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "S": 1.05, "C
 SLACK = 1.25
 
 
-def bonds(m: Molecule) -> list[tuple[int, int]]:
+def bonds(m: Any) -> list[tuple[int, int]]:
     """Bonds between sites, heavier site first: atoms within bonding distance, the shortest links between parts, and
     massless sites to their nearest atoms."""
     atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
@@ -100,5 +98,5 @@ def bonds(m: Molecule) -> list[tuple[int, int]]:
     return sorted(found) + [(min(atoms, key=lambda i, s=s: round(_distance(m, i, s), 9)), s) for s in massless]
 
 
-def _distance(m: Molecule, i: int, j: int) -> float:
+def _distance(m: Any, i: int, j: int) -> float:
     return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))

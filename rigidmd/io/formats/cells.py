@@ -1,5 +1,6 @@
 """Periodic cells of any shape and orientation, as in structure files. Rows a, b, c, lab frame, Å."""
 
+import contextlib
 from itertools import product
 
 import numpy as np
@@ -102,6 +103,17 @@ def right_angled(cell: np.ndarray) -> bool:
     """Whether the edges of a cell (3, 3) are at right angles, to the digits of files."""
     unit = cell / np.linalg.norm(cell, axis=1)[:, None]
     return bool(np.abs((unit @ unit.T)[np.triu_indices(3, 1)]).max() <= RIGHT)
+
+
+def cell_of(parameters: list[float]) -> np.ndarray | None:
+    """The cell (3, 3) with these edges and angles; None if no cell has them."""
+    from ase.geometry import cellpar_to_cell
+
+    edges, angles = np.array(parameters).reshape(2, 3)
+    if np.isfinite(edges).all() and (edges > 0).all() and (angles > 0).all() and (angles < 180).all():
+        with contextlib.suppress(AssertionError):  # raised by ASE if three edges cannot form the angles
+            return cellpar_to_cell([*edges, *angles])
+    return None
 
 
 def pairs_within(

@@ -1,0 +1,121 @@
+"""XYZ, plain and extended. ASE reads it, with corrections before and after."""
+
+import io
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.core.toml import parse_whole_number
+from rigidmd.io.formats import Format, System
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.text import atom_count, numbers, without_fortran
+from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, from_ase, read_by_ase
+from rigidmd.io.formats.through_mdanalysis import FrameFiles
+
+
+def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = None) -> list[Callable[[], Atoms]]:
+    """The frames of a plain or extended .xyz through ASE, which needs elements, while many files have names.
+    `atom_types`: name in the file, such as a type of LAMMPS -> name of the atom."""
+    labels, clean, at = [], [], 0
+    while at < len(lines):
+        if not lines[at].strip():
+            at += 1
+            continue
+        count = atom_count(path, at + 1, lines[at].strip(), len(lines) - at - 2)
+        clean += [lines[at], re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", lines[at + 1])]
+        properties = re.search(r"Properties=\"?([^\s\"]+)", lines[at + 1], re.IGNORECASE)
+        column, place, width = _columns(properties[1]) if properties else (0, 1, 4)
+        what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
+        lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
+        if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
+            raise structure_error(path, f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}")
+        for k in range(at + 2, at + 2 + count):
+            words = lines[k].split()
+            if len(words) < width:
+                raise structure_error(path, f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}")
+            if place is not None:
+                numbers(path, k + 1, words[place : place + 3], what)
+            words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
+            labels.append(None)
+            if column is not None:
+                labels[-1] = _label(words[column], atom_types)
+                _, symbol = labels[-1]
+                words[column] = "H" if symbol in HEAVY_HYDROGEN else symbol or "X"
+            clean.append(" ".join(words))
+        at += 2 + count
+    frames, first = [], 0
+    for atoms in read_by_ase(path, io.StringIO("\n".join(clean) + "\n"), format="extxyz") if clean else []:
+        of_frame = labels[first : first + len(atoms)]
+        first += len(atoms)
+        named = len(of_frame) == len(atoms) and None not in of_frame
+        names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
+        if NAMES in atoms.arrays:
+            names = [str(name) for name in atoms.arrays[NAMES]]
+        masses = atoms.get_masses() if atoms.has("masses") else None
+        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms), masses))
+    return frames
+
+
+def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
+    """Name and element of an atom. The name in the file may be that of a type, or an atomic number."""
+    from ase.data import chemical_symbols
+
+    name = (atom_types or {}).get(name, name)
+    if (number := parse_whole_number(name)) is not None and 0 < number < len(chemical_symbols):
+        name = chemical_symbols[number]
+    symbol = name.capitalize()
+    return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
+
+
+def _residues(atoms) -> list[tuple] | None:
+    """Residues from ASE's arrays of them; None without."""
+    if not {RESIDUE_NAMES, RESIDUE_NUMBERS} <= set(atoms.arrays):
+        return None
+    numbers = atoms.arrays[RESIDUE_NUMBERS]
+    if numbers.dtype.kind != "i":
+        return None
+    return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
+
+
+def _columns(properties: str) -> tuple[int | None, int | None, int]:
+    """Columns of the species and of the positions, or None, and the number of columns: 0, 1 and 4 for
+    `species:S:1:pos:R:3`."""
+    words, column, found = properties.split(":"), 0, {}
+    for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
+        found["species" if name.lower() == "symbols" else name.lower()] = column
+        column += 1 if (columns := parse_whole_number(width)) is None else columns
+    return found.get("species"), found.get("pos"), column
+
+
+def encoder(system: System, interval: float, velocities: bool) -> Callable[[Frame, int], bytes]:
+    """Extended XYZ, for OVITO and ASE: box and time are in the comment line."""
+    files = FrameFiles(system, velocities, "XYZ")
+
+    def encode(frame: Frame, k: int) -> bytes:
+        def write(writer, atoms):
+            writer.remark = _comment(frame.cell, frame.time)
+            writer.write(atoms)
+
+        return files.content(frame, write).removesuffix(b"\n\n") + b"\n"
+
+    return encode
+
+
+def _comment(cell: np.ndarray | None, time: float) -> str:
+    box = 'pbc="F F F"'
+    if cell is not None:
+        edges = " ".join(f"{x:.9g}" for x in cell.flat)
+        box = f'Lattice="{edges}" pbc="T T T"'
+    return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"
+
+
+FORMATS = [
+    Format(
+        (".xyz", ".extxyz"), read=read_xyz, has_types=True, encoder=encoder,
+        content=re.compile(r"\A\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"),
+        times=re.compile(rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)'),
+    ),
+]  # fmt: skip
