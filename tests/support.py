@@ -290,10 +290,9 @@ HOMES = {
     "io.formats.through_ase": "EV",
     "io.formats.traj": "TrajFile TrajReader",
     "compile": "SIMD_BITS implements call call_blocks pack_arguments",
-    "compile.cache": "COMPILED cache_folder source_digest",
+    "compile.cache": "COMPILED CacheIndex cache_folder source_digest",
     "compile.simd": "lane_count",
     "compile.machine": "MOST_THREADS",
-    "compile.numba_private": "CacheIndex",
     "commands.arguments": "COMMANDS read_scene",
     "core.files": "AppendedFile",
     "core.integrators": "DRIFT FORMULATIONS Flow KICK REMOVE_MOMENTUM SCHEMES Solver WITH_THERMOSTAT composed split",
@@ -352,7 +351,7 @@ HOMES = {
     "mechanics.rotation": (
         "align angular_velocity_of_euler_rates attitude_matrix euler_rates from_attitude_matrix "
         "from_euler_angles from_quaternion from_vector from_yaw_pitch_roll hat nearest_rotation "
-        "orthogonality_error to_euler_angles to_quaternion to_yaw_pitch_roll"
+        "orthogonality_error to_euler_angles to_quaternion"
     ),
     "mechanics.free_rotor": "ExactRotor NO_SYMMETRY NoRotor split_rotor",
     "mechanics.time_functions": (

@@ -29,13 +29,12 @@ from rigidmd.compile import (
     call_blocks,
     kernel,
     load_arguments,
-    numba_private,
     pack_arguments,
     task,
 )
-from rigidmd.compile.cache import cache_folder
-from rigidmd.compile.layout import array_struct
-from rigidmd.compile.numba_private import CacheIndex, InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
+from rigidmd.compile.cache import CacheIndex, cache_folder
+from rigidmd.compile.code import array_struct
+from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
 
@@ -94,13 +93,13 @@ def test_a_dispatcher_opens_its_cache_only_to_compile():
         return x
 
     assert isinstance(unused, CPUDispatcher) and type(unused) is KernelDispatcher
-    assert "_opened" not in vars(unused)
+    assert "_cache" not in vars(unused)
 
 
 @pytest.fixture
 def empty_cache(tmp_path, monkeypatch):
     """Kernels that a test defines are compiled in it: Numba does not show code that comes from the cache."""
-    monkeypatch.setattr(numba_private, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr("rigidmd.compile.cache.cache_folder", lambda: str(tmp_path))
 
 
 def llvm_of(dispatcher):
@@ -208,7 +207,7 @@ def _tell(task_arguments, block):
     mixed.plane[0, 0] = -1.0
 
 
-def test_arrays_are_stored_as_layout_assumes():
+def test_arrays_are_stored_as_assumed():
     kind, context = types.Array(types.float64, 2, "C"), cpu_target.target_context
     model, assumed = context.data_model_manager[kind], array_struct(2)
     stored = [
@@ -218,7 +217,7 @@ def test_arrays_are_stored_as_layout_assumes():
     size = context.get_abi_sizeof(context.get_value_type(kind))
     assert (fields, ctypes.sizeof(assumed)) == (stored, size), (
         f"Numba {numba.__version__} stores an array as {stored} (name, bytes), {size} bytes in all; rigidmd/compile/"
-        f"layout.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `_fill` there"
+        f"code.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `_c_value` there"
     )
 
 
@@ -300,17 +299,18 @@ def test_every_block_is_worked_on_once_whichever_thread_takes_it():
 
 # --- a second process ------------------------------------------------------------------------------------------------
 
-#: Compiles `_add` for several types while a helper does so too, from the other end; prints what was read from the cache.
+#: Compiles `_add` for several types while another process does so too, from the other end; prints what was read from the
+#: cache.
 BOTH = """
-import numba, numpy as np
-from rigidmd.compile import TaskArguments, second_process
+import numba, numpy as np, time
+from rigidmd.compile import TaskArguments, code
 from test_compile import _add
 contents = [(np.zeros(3, kind), x) for kind in (float, "f4") for x in (0.0, 0)]
 wanted = [(*_add.name, TaskArguments(numba.typeof(content))) for content in contents]
-with second_process.use_helper(wanted):
-    helper = second_process._helper.get()
-    with helper._changed:
-        helper._changed.wait_for(lambda: helper._ended or len(helper._done) >= 2)
+with code.second_process(wanted):
+    deadline = time.monotonic() + WAIT
+    while time.monotonic() < deadline and not _add.is_ready(wanted[-2][2]):
+        time.sleep(0.05)
     for _, _, kind in wanted:
         _add.address(kind)
 print([_add.compiled[kind]._cache_hits for _, _, kind in wanted][-2:])
@@ -326,14 +326,12 @@ def with_compilers(count: str, asked: str, tmp_path) -> subprocess.CompletedProc
 
 
 def test_a_second_process_compiles_the_last_tasks_first(tmp_path):
-    done = with_compilers("2", BOTH, tmp_path)
+    done = with_compilers("2", BOTH.replace("WAIT", "120"), tmp_path)
     assert done.stdout.split("\n")[0] == "[1, 1]", done.stderr
 
 
 def test_compiling_goes_on_alone_where_the_second_process_ends(tmp_path):
-    lost = BOTH.replace(
-        "with second_process.use", "second_process.HELPER_PROGRAM = 'raise SystemExit'\nwith second_process.use"
-    )
+    lost = BOTH.replace("with code", "code.SECOND_PROGRAM = 'raise SystemExit'\nwith code").replace("WAIT", "3")
     done = with_compilers("2", lost, tmp_path)
     assert done.stdout.split("\n")[0] == "[0, 0]", done.stderr
 
@@ -368,7 +366,7 @@ def test_one_compiler_plans_nothing(tmp_path):
 
 @pytest.mark.parametrize("named", ["0", "three", ""])
 def test_a_wrong_number_of_compilers_is_one_sentence(named, tmp_path):
-    asked = "from rigidmd.compile.second_process import compiler_processes\ncompiler_processes()"
+    asked = "from rigidmd.compile.code import compiler_processes\ncompiler_processes()"
     done = with_compilers(named, asked, tmp_path)
     assert f"RIGIDMD_COMPILERS is {named!r}, must be 1 or 2" in done.stderr
 
@@ -522,7 +520,7 @@ def compiled_functions():
             for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
                 call = mark if isinstance(mark, ast.Call) else ast.Call(mark, [], [])
                 kind = getattr(call.func, "id", "")
-                if kind in ("kernel", "task", "implements"):
+                if kind in ("kernel", "task", "implements", "chosen_by_type"):
                     keys = {key.arg: ast.unparse(key.value) for key in call.keywords}
                     name = ast.unparse(call.args[0]).rpartition(".")[2] if kind == "implements" else node.name
                     yield name, node, keys

@@ -20,7 +20,6 @@ from support import (
     random_rotations,
     to_euler_angles,
     to_quaternion,
-    to_yaw_pitch_roll,
 )
 
 ROUNDING = 2e-15  # some ten roundings of a number near 1
@@ -115,25 +114,17 @@ def test_euler_angles_and_yaw_pitch_roll_are_the_sequences_they_claim():
     assert from_yaw_pitch_roll(flat) == pytest.approx(Rotation.from_euler("ZYX", flat).as_matrix())
     q = random_rotations(rng, 200)
     assert same_angle(to_euler_angles(q), Rotation.from_matrix(q).as_euler("ZXZ")) < 1e-12
-    assert same_angle(to_yaw_pitch_roll(q), Rotation.from_matrix(q).as_euler("ZYX")) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("back", "there", "low", "high"),
-    [
-        (from_euler_angles, to_euler_angles, 0, np.pi),
-        (from_yaw_pitch_roll, to_yaw_pitch_roll, -np.pi / 2, np.pi / 2),
-    ],
-)
-def test_angles_give_every_rotation_back(back, there, low, high):
+def test_angles_give_every_rotation_back():
     q = all_rotations(np.random.default_rng(3))
-    angles = there(q)
-    assert np.abs(back(angles) - q).max() < ROUNDING
-    assert np.all((angles[:, 1] >= low) & (angles[:, 1] <= high))
+    angles = to_euler_angles(q)
+    assert np.abs(from_euler_angles(angles) - q).max() < ROUNDING
+    assert np.all((angles[:, 1] >= 0) & (angles[:, 1] <= np.pi))
     assert np.all((angles[:, [0, 2]] > -np.pi) & (angles[:, [0, 2]] <= np.pi))
-    assert not np.signbit(there(np.eye(3))).any()  # nobody wants to read -0
+    assert not np.signbit(to_euler_angles(np.eye(3))).any()  # nobody wants to read -0
     stack = q[:24].reshape(2, 3, 4, 3, 3)
-    assert np.array_equal(there(stack), angles[:24].reshape(2, 3, 4, 3))
+    assert np.array_equal(to_euler_angles(stack), angles[:24].reshape(2, 3, 4, 3))
 
 
 def test_euler_angles_close_to_the_lock_keep_their_digits():
@@ -146,15 +137,12 @@ def test_euler_angles_close_to_the_lock_keep_their_digits():
 
 
 def test_at_the_lock_the_first_angle_holds_everything():
-    half_turn_x, quarter_y = np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    half_turn_x = np.diag([1.0, -1, -1])
     turn = from_vector([0, 0, 0.4])
     assert to_euler_angles(from_euler_angles([1.5, 0, -0.2])) == pytest.approx([1.3, 0, 0], abs=ROUNDING)
     assert to_euler_angles(turn @ half_turn_x) == pytest.approx([0.4, np.pi, 0], abs=ROUNDING)
     assert to_euler_angles(half_turn_x @ turn) == pytest.approx([-0.4, np.pi, 0], abs=ROUNDING)
     assert np.array_equal(to_euler_angles(np.diag([-1.0, -1, 1])), [np.pi, 0, 0])
-    assert to_yaw_pitch_roll(turn @ quarter_y) == pytest.approx([0.4, np.pi / 2, 0], abs=ROUNDING)
-    assert to_yaw_pitch_roll(turn @ quarter_y.T) == pytest.approx([0.4, -np.pi / 2, 0], abs=ROUNDING)
-    assert to_yaw_pitch_roll(quarter_y @ from_vector([0.4, 0, 0])) == pytest.approx([-0.4, np.pi / 2, 0], abs=ROUNDING)
 
 
 def test_euler_rates_are_those_of_the_rotation():

@@ -14,7 +14,7 @@ from support import BUILDS, ROOT, SCHEMES, build, built, move, small_scene
 from support import pair_loop as pairs
 
 from rigidmd.compile import SIMD_BITS, TaskArguments, kernel, simd
-from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
+from rigidmd.compile.simd_memory import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.units import KJ_PER_MOL
 
 PRECISIONS = {"double": np.float64, "mixed": np.float32}

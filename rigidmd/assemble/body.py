@@ -1,33 +1,27 @@
-"""The system of a scene of a single body: translation, rotor, frame, resistance, terms, state at the start."""
+"""The system of a scene of a single body, and errors of keys that do not apply to the body or have no effect on it."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from rigidmd.assemble.body_errors import body_errors, integrator_errors, torque_errors
-from rigidmd.assemble.body_parts import (
-    carried_fluid,
-    frame_of,
-    inertia_of,
-    principal,
-    resistance_of,
-    rotor_of,
-    terms_of,
-)
+from rigidmd.assemble import body_parts as parts
 from rigidmd.assemble.defaults import body_with_defaults
 from rigidmd.assemble.memory_check import check_memory_of_samples
+from rigidmd.core.integrators import SCHEMES, SOLVERS
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce
-from rigidmd.forces.body.frame import InertialFrame
+from rigidmd.forces.body.frame import InertialFrame, RotatingFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.io.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor
-from rigidmd.mechanics.time_functions import values_at
+from rigidmd.mechanics.time_functions import has_constant_direction, values_at
 from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, NoTranslation
 from rigidmd.scene import BodyScene
+from rigidmd.scene.body import axis_of_symmetry
+from rigidmd.scene.body_forces import Applied
 from rigidmd.scene.validation import not_none
 
 
@@ -37,12 +31,12 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     applied : name -> function of a `Pose` that returns a force (3,) in N along the lab's axes, at the centre of mass,
         and a torque (3,) in N m along the body's axes
     """
-    mass, tensor, centre, points, names = inertia_of(scene)
-    added_mass, added_inertia, displaced = carried_fluid(scene)
+    mass, tensor, centre, points, names = parts.inertia_of(scene)
+    added_mass, added_inertia, displaced = parts.carried_fluid(scene)
     if scene.changing_inertia is not None:
         moments, axes = np.array(scene.changing_inertia.inertia_kg_m2[0]), np.eye(3)
     else:
-        moments, axes = principal(tensor)
+        moments, axes = parts.principal(tensor)
     moments = moments + added_inertia
     rotates, applied = bool(moments.any()), applied or {}
     faults = body_errors(scene, centre, moments, axes, added_mass)
@@ -63,16 +57,16 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
 
     scene = body_with_defaults(scene, rotates, float(np.linalg.norm(points, axis=1).max()))
     check_memory_of_samples(scene)
-    rotor = rotor_of(scene, moments, added_inertia, axes) if rotates else NoRotor()
-    frame = frame_of(scene)
+    rotor = parts.rotor_of(scene, moments, added_inertia, axes) if rotates else NoRotor()
+    frame = parts.frame_of(scene)
     if scene.body.pinned:
         translation = NoTranslation(mass)
     elif added_mass.any():
         translation = FluidTranslation(mass, mass + added_mass)
     else:
         translation = FreeTranslation(mass)
-    body = Body(translation, rotor, frame, resistance_of(scene))
-    terms = terms_of(scene, mass, axes, centre, displaced)
+    body = Body(translation, rotor, frame, parts.resistance_of(scene))
+    terms = parts.terms_of(scene, mass, axes, centre, displaced)
     terms |= {name: PythonForce() for name in applied}
     system = BodySystem(
         scene=scene, body=body, state=_first_state(scene, body, moments, axes, attitude, spin, rotates), terms=terms,
@@ -124,3 +118,128 @@ def _left_out(system: BodySystem) -> list[str]:
         "forces: none": not system.terms,
     }
     return [reason for reason, applies in reasons.items() if applies]
+
+
+def body_errors(
+    scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
+) -> list[str]:
+    """Messages on keys of any table that do not apply to this body, or would have no effect on it."""
+    faults, body, fluid = [], scene.body, scene.fluid
+    rotates, along_axes = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    if not rotates:
+        faults += _rotation_keys_of_point(scene)
+        if body.pinned:
+            faults.append("body: a point at the pivot cannot move; give it inertia or a centre_of_mass_m")
+        if added_mass.any():
+            faults.append("fluid.added_mass_kg: a point carries no fluid along; leave it out")
+        for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
+            if fluid is not None and len(set(getattr(fluid, key))) > 1:
+                faults.append(f"fluid.{key}: a point has no axes: give three equal numbers")
+    elif added_mass.any():
+        for k in np.flatnonzero(moments == 0):
+            if added_mass[k - 1] != added_mass[k - 2]:
+                faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
+    if rotates and not along_axes:
+        faults += _keys_of_principal_axes(scene)
+    if (scene.wheels or scene.changing_inertia) and rotates and not (moments > 0).all():
+        faults.append("wheels and changing_inertia need a body with inertia about every axis")
+    if scene.output.drawn_as == "top" and rotates:
+        at_centre, _ = parts.principal(parts.inertia_at_centre(scene))
+        if axis_of_symmetry(at_centre) is None:
+            shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
+            faults.append(
+                "output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are "
+                f"{shown} kg m²; name 'cuboid', 'ellipsoid' or a solid"
+            )
+    if body.pinned:
+        if scene.changing_inertia is not None and centre.any():
+            faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
+        if scene.gravity is not None and not centre.any() and rotates:
+            faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
+        idle = [k for k, entry in enumerate(scene.applied) if entry.force_N is not None and not any(entry.at_m or ())]
+        faults += [f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m" for k in idle]
+    return faults
+
+
+def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
+    """Messages on keys of rotation, which a point does not have."""
+    start, none = scene.start, type(scene.start)()
+    named = [f"start.{key}" for key in type(start).model_fields if getattr(start, key) != getattr(none, key)]
+    idle = [key for key in named if key not in ("start.position_m", "start.velocity_m_s")]
+    idle += [key for key in ("friction", "wheels") if getattr(scene, key)]
+    idle += [f"run.{key}" for key in ("formulation", "rotor") if getattr(scene.run, key) is not None]
+    if scene.fluid is not None:
+        keys = ("linear_rotational_resistance_N_m_s", "quadratic_rotational_resistance_N_m_s2", "added_inertia_kg_m2")
+        idle += [f"fluid.{key}" for key in keys if any(getattr(scene.fluid, key) or ())]
+    if scene.output.axis is not None:
+        idle.append("output.axis")
+    return [f"{key}: the body has no inertia: a point does not rotate" for key in idle]
+
+
+def _keys_of_principal_axes(scene: BodyScene) -> list[str]:
+    """Messages on keys along the body's axes, which must be principal axes unless all three values are equal."""
+    faults = []
+    for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
+        for key in type(section).model_fields if section else ():
+            value = getattr(section, key)
+            if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
+                continue
+            if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
+                faults.append(
+                    f"{name}.{key} is given along the body's axes, which are not principal axes of its inertia: "
+                    "give the body in its principal axes"
+                )
+    return faults
+
+
+def torque_errors(entry: Applied, k: int, axes: np.ndarray, moments: np.ndarray, rotates: bool) -> list[str]:
+    """Messages on torques about axes without inertia."""
+    if entry.torque_N_m is None and entry.at_m is None:
+        return []
+    if not rotates:
+        return [f"applied.{k}: a point has no inertia, and a torque cannot rotate it"]
+    if (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
+        torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
+        arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
+        if torques[:, moments == 0].any() or arm[moments > 0].any():
+            return [f"applied.{k}: nothing resists a torque about the axis of a linear body"]
+    return []
+
+
+def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+    """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid adds mass;
+    has_functions: Python functions apply forces."""
+    run, resistance = scene.run, parts.resistance_of(scene)
+    resisted = not isinstance(resistance, NoResistance)
+    if run.is_auto:
+        return []
+    if run.integrator in SOLVERS:
+        if resisted and resistance.rotation_dry.any():
+            what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
+            return [f"run: {what}: use velocity_verlet"]
+        return []
+    scheme = run.scheme
+    if resisted and min(scheme.kicks) < 0:
+        forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
+        return [f"run: {run.integrator} has negative substeps, which a resistance does not allow: use one of {forward}"]
+    if scheme.has_gradient and (resisted or scene.applied or has_functions):
+        plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
+        return [
+            f"run: {run.integrator} needs the gradient of the forces, which resistance and applied forces do not have; "
+            f"use one of {', '.join(plain)}"
+        ]
+    frame = parts.frame_of(scene)
+    axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
+    why = {
+        "wheels": scene.wheels,
+        "changing_inertia": scene.changing_inertia,
+        "added mass": immersed,
+        "a frame that changes its axis": axis_changes,
+    }
+    split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
+    return [
+        f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "
+        f"use one of {', '.join(split)} with rotor = 'split'"
+        for what, there in why.items()
+        if there and scheme.exact_rotor
+    ]

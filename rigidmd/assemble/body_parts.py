@@ -1,5 +1,6 @@
 """Parts of a single body from the tables of its scene: inertia, fluid, rotor, frame, resistance, forces."""
 
+# isort: skip_file
 from itertools import permutations
 
 import numpy as np
@@ -12,14 +13,9 @@ from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
 from rigidmd.mechanics.time_functions import (
-    TimeFunction,
-    constant_function,
-    integrate_function,
-    interpolated_function,
-    is_constant_function,
-    pulse_function,
+    TimeFunction, constant_function, integrate_function, interpolated_function, is_constant_function, pulse_function,
     sum_functions,
-)
+)  # fmt: skip
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body_forces import Fluid, Friction, Timed
 from rigidmd.scene.validation import not_none

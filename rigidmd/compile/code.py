@@ -1,25 +1,101 @@
-"""Machine code that is called by address. Each address carries the type for which the code was compiled."""
+"""Tasks: machine code that is called by address. Each address carries the type for which the code was compiled.
 
+Private parts of Numba, tested by tests/test_compile.py: the values of tuples and of `ArrayModel` are C structs, which
+`NumbaStruct` fills. A call from Python would instead compile code that unpacks every array of every argument, a second
+of compiling for the forty arrays of a term, and every call would run all of it.
+"""
+
+import contextlib
 import ctypes
 import hashlib
+import importlib
+import os
+import pickle
+import subprocess
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
+from filelock import FileLock, Timeout
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.core.imputils import impl_ret_borrowed
-from numba.extending import NativeValue, intrinsic, models, overload, register_model, typeof_impl, unbox
+from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
 
-from rigidmd.compile import second_process, thread_pool
-from rigidmd.compile.kernels import compiler_options, kernel
-from rigidmd.compile.layout import AddressType, NumbaStruct
-from rigidmd.compile.numba_private import LINKED_OPTIONS, compile_callback, load_callback, reference_counting
-from rigidmd.compile.pointers import cast_pointer, function_at, pointer_to
+from rigidmd.compile import thread_pool
+from rigidmd.compile.cache import cache_folder, is_persistent
+from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options, kernel
+from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
+from rigidmd.errors import SettingError
+
+# --- values in memory ------------------------------------------------------------------------------------------------
+
+#: C types of the numbers of compiled code.
+C_TYPES = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.float32: ctypes.c_float} | {
+    kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64
+}
+
+
+class AddressType(types.Type):
+    """Base of types whose values are 64-bit integers in compiled code: the `address_value` of the Python object."""
+
+    bitwidth = 64
+
+
+class NumbaStruct:
+    """A value in memory as compiled code stores it, at `address`. Its arrays are kept here, and not reference-counted.
+
+    Raises TypeError if the value contains anything but numbers, arrays, None, codes, and tuples of these.
+    """
+
+    def __init__(self, value: Any):
+        self.value, self.kind = value, numba.typeof(value)
+        self._memory = _c_value(self.kind, value)
+        self.address = ctypes.addressof(self._memory)
+
+
+def _c_value(kind: types.Type, value: Any) -> Any:
+    """A value as an object of ctypes with its own memory."""
+    if isinstance(kind, types.Array):
+        struct, numbers = array_struct(kind.ndim), ctypes.c_ssize_t * kind.ndim
+        sizes = value.size, value.itemsize, value.ctypes.data
+        return struct(None, None, *sizes, numbers(*value.shape), numbers(*value.strides))
+    if isinstance(kind, types.BaseTuple):
+        parts = [_c_value(*pair) for pair in zip(kind.types, value, strict=True)]
+        return _struct(tuple((f"item_{k}", type(part)) for k, part in enumerate(parts)))(*parts)
+    if isinstance(kind, AddressType):
+        return ctypes.c_int64(value.address_value)
+    if kind is types.none:
+        return ctypes.c_void_p()
+    if kind not in C_TYPES:
+        raise TypeError(f"a value of type {kind} cannot be an argument of a task")
+    return C_TYPES[kind](value)
+
+
+@cache
+def _struct(fields: tuple[tuple[str, Any], ...]) -> type[ctypes.Structure]:
+    """The C struct of named values, each aligned to its own size, like a struct of LLVM."""
+    return type("NumbaTuple", (ctypes.Structure,), {"_fields_": fields})
+
+
+@cache
+def array_struct(dimensions: int) -> type[ctypes.Structure]:
+    """The C struct of an array, with the fields of Numba's `ArrayModel` in the same order."""
+    numbers = ctypes.c_ssize_t * dimensions
+    owners = ("meminfo", ctypes.c_void_p), ("parent", ctypes.c_void_p)
+    content = ("nitems", ctypes.c_ssize_t), ("itemsize", ctypes.c_ssize_t), ("data", ctypes.c_void_p)
+    return _struct((*owners, *content, ("shape", numbers), ("strides", numbers)))
+
+
+# --- tasks -----------------------------------------------------------------------------------------------------------
 
 
 class TaskArguments(types.Type):
@@ -35,10 +111,7 @@ class TaskArguments(types.Type):
         return self.content
 
 
-@register_model(TaskArguments)
-class _TaskArgumentsModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, cgutils.voidptr_t)  # the pointers that Numba keeps in variables
+register_model(TaskArguments)(models.OpaqueModel)  # the pointers that Numba keeps in variables
 
 
 @intrinsic
@@ -74,61 +147,38 @@ class CompiledTask:
         self.function, self.options = function, options
         self.compiled = {}
 
-    def address(self, arguments_type: TaskArguments) -> int:
-        """Address of the machine code for arguments of this type, which is compiled or read from the cache."""
-        if arguments_type not in self.compiled:
-            second_process.wait_for(*self.name, arguments_type)
-            thread_pool.start_workers()
-            code = compile_callback(self.function, (arguments_type, types.intp), self.options)
-            self.compiled.setdefault(arguments_type, code)  # the code of another thread may already be in use
-        return self.compiled[arguments_type].address
-
     @property
     def name(self) -> tuple[str, str]:
         """Its module, and its name in that module."""
         return self.function.__module__, self.function.__name__
 
+    def address(self, arguments_type: TaskArguments) -> int:
+        """Address of the machine code for arguments of this type, which is compiled or read from the cache.
+
+        Processes that need the same code compile it once: the others wait, and read it from the cache.
+        """
+        if not self.is_ready(arguments_type):
+            digest = hashlib.sha256(repr((self.name, arguments_type)).encode()).hexdigest()[:16]
+            with contextlib.ExitStack() as held:
+                with contextlib.suppress(OSError, Timeout):
+                    held.enter_context(FileLock(Path(cache_folder()) / f"{digest}.lock", timeout=LONGEST_WAIT))
+                code = compile_callback(self.function, (arguments_type, types.intp), self.options)
+            self.compiled.setdefault(arguments_type, code)  # the code of another thread may already be in use
+        return self.compiled[arguments_type].address
+
     def is_ready(self, arguments_type: TaskArguments) -> bool:
-        """Whether `address` has nothing to compile."""
+        """Whether `address` has nothing to compile. Code in the cache is read."""
         if arguments_type not in self.compiled:
             thread_pool.start_workers()
-            code = load_callback(self.function, (arguments_type, types.intp), self.options)
-            if code is None:
-                return False
-            self.compiled.setdefault(arguments_type, code)
-        return True
+            with contextlib.suppress(NotStored):
+                code = compile_callback(self.function, (arguments_type, types.intp), self.options, stored_only=True)
+                self.compiled.setdefault(arguments_type, code)
+        return arguments_type in self.compiled
 
 
 def task(*, count_references=True):
     """Decorator that makes a `CompiledTask` of a function, with the options of `kernel`."""
-    return lambda function: CompiledTask(function, **compiler_options(False), **reference_counting(count_references))
-
-
-#: Held while codes are compiled together: of several runs at once, one compiles and the others read its result.
-_compiling = threading.RLock()
-#: Tasks of each `Code` while they are only collected and not compiled, in this thread; None otherwise.
-_collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar("collected", default=None)
-
-
-def compile_together(make: Callable[[], object]) -> None:
-    """Compile every `Code` that a function makes, with the help of a second process if that saves time.
-
-    The function is first called only to collect the tasks and types of its codes. These have no addresses, so it must
-    not call them.
-    """
-    if second_process.compiler_processes() == 1:
-        return
-    with _compiling:
-        collected: list[tuple[CompiledTask, TaskArguments]] = []
-        before = _collected.set(collected)
-        try:
-            make()
-        finally:
-            _collected.reset(before)
-        missing = [(*one.name, kind) for one, kind in dict.fromkeys(collected) if not one.is_ready(kind)]
-        if len(missing) >= second_process.FEWEST_TASKS:
-            with second_process.use_helper(missing):
-                make()
+    return lambda function: CompiledTask(function, **compiler_options(count_references=count_references))
 
 
 class Code:
@@ -194,10 +244,7 @@ def _typeof_code(value, context):
     return value.numba_type
 
 
-@register_model(CodeType)
-class _CodeModel(models.PrimitiveModel):
-    def __init__(self, manager, code):
-        super().__init__(manager, code, ir.IntType(64))
+register_model(CodeType)(models.IntegerModel)
 
 
 @unbox(CodeType)
@@ -223,18 +270,6 @@ def address_of(typing, code, name, task_arguments):
     return types.intp(code, name, task_arguments), emit
 
 
-@intrinsic
-def _call_at(typing, address, task_arguments, block):
-    """Call the machine code at an address."""
-
-    def emit(context, builder, signature, arguments):
-        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, ir.IntType(64)])
-        builder.call(function_at(builder, arguments[0], kind), arguments[1:])
-        return context.get_dummy_value()
-
-    return types.void(types.intp, task_arguments, types.intp), emit
-
-
 class BoundTask:
     """A task with its arguments, for Python to call without holding its lock.
 
@@ -256,28 +291,96 @@ class BoundTask:
 @kernel
 def _call_blocks_at(address, task_arguments, blocks):
     if blocks == 1:
-        _call_at(address, task_arguments, 0)
+        thread_pool.call_address(address, task_arguments, 0)
     else:
         thread_pool.run_on_all_threads(address, task_arguments, blocks)
 
 
+@chosen_by_type(inline=True, prefer_literal=True)
 def call(code, name, task_arguments):
     """Call a task for block 0 by its name, a literal. Arguments of another type are a compilation error."""
-    raise TypeError("compiled code only")
+    return lambda code, name, task_arguments: thread_pool.call_address(
+        address_of(code, name, task_arguments), task_arguments, 0
+    )
 
 
+@chosen_by_type(inline=True, prefer_literal=True)
 def call_blocks(code, name, task_arguments, blocks):
     """Call a task for every block; on all threads if there are several blocks."""
-    raise TypeError("compiled code only")
-
-
-@overload(call, prefer_literal=True, jit_options=compiler_options(True) | LINKED_OPTIONS)
-def _call(code, name, task_arguments):
-    return lambda code, name, task_arguments: _call_at(address_of(code, name, task_arguments), task_arguments, 0)
-
-
-@overload(call_blocks, prefer_literal=True, jit_options=compiler_options(True) | LINKED_OPTIONS)
-def _call_blocks(code, name, task_arguments, blocks):
     return lambda code, name, task_arguments, blocks: _call_blocks_at(
         address_of(code, name, task_arguments), task_arguments, blocks
     )
+
+
+# --- two processes that compile --------------------------------------------------------------------------------------
+
+#: Held while codes are compiled together: of several runs at once, one compiles and the others read its result.
+_compiling = threading.RLock()
+#: Tasks of each `Code` while they are only collected and not compiled, in this thread; None otherwise.
+_collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar("collected", default=None)
+#: Least number of tasks for a second process; for fewer, importing the package there takes longer.
+FEWEST_TASKS = 3
+#: Longest time to wait for the code of another process, s.
+LONGEST_WAIT = 120.0
+#: Program of the second process, which finds the package with the same search path.
+SECOND_PROGRAM = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from rigidmd.compile import code; code.compile_requested()"
+)  # fmt: skip
+
+
+def compiler_processes() -> int:
+    """Number of processes that compile: `RIGIDMD_COMPILERS`, 1 or 2; default: 2."""
+    named = os.environ.get("RIGIDMD_COMPILERS", "2")
+    if named not in ("1", "2"):
+        raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
+    return int(named) if MOST_THREADS > 1 and sys.executable and is_persistent() else 1
+
+
+def compile_together(make: Callable[[], object]) -> None:
+    """Compile every `Code` that a function makes, in two processes if that saves time.
+
+    Python and LLVM compile one function at a time per process. A second process begins with the last task, and this one
+    with the first. The function is first called only to collect the tasks and types of its codes. These have no
+    addresses, so it must not call them.
+    """
+    if compiler_processes() == 1:
+        return
+    with _compiling:
+        collected: list[tuple[CompiledTask, TaskArguments]] = []
+        before = _collected.set(collected)
+        try:
+            make()
+        finally:
+            _collected.reset(before)
+        missing = [(*one.name, kind) for one, kind in dict.fromkeys(collected) if not one.is_ready(kind)]
+        if len(missing) >= FEWEST_TASKS:
+            with second_process(missing):
+                make()
+
+
+@contextlib.contextmanager
+def second_process(wanted: Sequence[tuple[str, str, TaskArguments]]) -> Iterator[None]:
+    """Within the block a second process compiles tasks (module, name, type), unless their types cannot be pickled."""
+    process = None
+    with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
+        content = pickle.dumps(sys.path) + pickle.dumps(wanted)
+        process = subprocess.Popen(
+            [sys.executable, "-c", SECOND_PROGRAM], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C goes to this process, which then ends the other
+        )  # fmt: skip
+        assert process.stdin is not None
+        process.stdin.write(content)
+        process.stdin.close()
+    try:
+        yield
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
+
+
+def compile_requested() -> None:
+    """In the second process: compile the tasks listed on standard input, the last one first."""
+    for module, name, arguments_type in reversed(pickle.load(sys.stdin.buffer)):
+        getattr(importlib.import_module(module), name).address(arguments_type)

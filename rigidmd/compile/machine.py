@@ -1,13 +1,45 @@
-"""The target processor of Numba, the width of its vectors, its threads, and the number of blocks of work."""
+"""The target processor of Numba, the width of its vectors, its threads, the number of blocks of work, and pointers.
+
+LLVM has only opaque pointers, and llvmlite is removing typed ones. The pointers of Numba are still typed, and llvmlite
+0.44, the oldest one supported, has an LLVM that needs typed pointers.
+"""
 
 import os
 
+import llvmlite
 import numba
 from llvmlite import binding, ir
 from numba.core.registry import cpu_target
 
-from rigidmd.compile.pointers import pointer_to
 from rigidmd.errors import SettingError
+
+#: Whether LLVM accepts opaque pointers. llvmlite has this attribute up to version 0.44, where the default is False.
+OPAQUE: bool = getattr(llvmlite, "opaque_pointers_enabled", True)
+
+
+def pointer_to(kind: ir.Type) -> ir.PointerType:
+    """The type of pointers to a type."""
+    return ir.PointerType() if OPAQUE else ir.PointerType(kind)
+
+
+def cast_pointer(builder, pointer, kind: ir.Type):
+    """A pointer for loads and stores of a type. Numba's pointers may have another type; opaque ones need no cast."""
+    return pointer if getattr(pointer.type, "is_opaque", True) else builder.bitcast(pointer, ir.PointerType(kind))
+
+
+class _FunctionPointer(ir.instructions.CastInstr):
+    """An opaque pointer to a function: llvmlite asks the pointer for the type of the function that it calls."""
+
+    function_type = None
+
+
+def function_at(builder, address, function_type: ir.FunctionType):
+    """The function at an address, an integer."""
+    pointer = builder.inttoptr(address, pointer_to(function_type))
+    if OPAQUE:
+        pointer.__class__, pointer.function_type = _FunctionPointer, function_type
+    return pointer
+
 
 #: LLVM names of the target: this machine, or the one set by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES.
 TRIPLE, PROCESSOR, _FEATURES = cpu_target.target_context.codegen().magic_tuple()

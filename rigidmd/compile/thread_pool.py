@@ -10,12 +10,19 @@ not the start of a parallel region and a barrier of all threads at its end.
 
 If the pool is busy, with another calling thread or because a block itself has blocks, the calling thread runs all its
 blocks alone. The blocks of a task, not the threads, determine the bits of a result.
+
+Measured on two cores against Numba's own layers (`prange` over the blocks): an empty task of 16 blocks takes 0.6 µs,
+with OpenMP 1.9 µs and with the work queue 80 µs. With OpenMP 500 argon atoms make 14 % fewer steps per second and 512
+waters 22 %; with the work queue 8 and 4 times fewer, and two calling threads at once end the process.
+
+Atomic operations and the calls of Python's locks are LLVM IR that llvmlite builds; nothing of Numba is private.
 """
 
 import ctypes
 import os
 import threading
 import time
+import timeit
 
 import llvmlite.binding
 import numpy as np
@@ -23,10 +30,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rigidmd.compile.kernels import compiler_options, kernel
-from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS
-from rigidmd.compile.numba_private import compile_callback, reference_counting
-from rigidmd.compile.pointers import function_at, pointer_to
+from rigidmd.compile.kernels import compile_callback, compiler_options, kernel
+from rigidmd.compile.machine import IS_X86, MOST_BLOCKS, MOST_THREADS, function_at, pointer_to
 
 INT64 = ir.IntType(64)
 # Indices of 64-bit cells in the memory of the pool. A cache line has 8; different threads write to different lines.
@@ -47,36 +52,32 @@ ALLOCATE, ACQUIRE, RELEASE = "PyThread_allocate_lock", "PyThread_acquire_lock", 
 POLLING_TIME = 50e-6
 
 
-def _on_cell(emit_on, result=types.int64):
-    """An intrinsic (address of the pool's memory, cell, ...) of integers."""
+def _on_cell(emit_on, *values, result=types.int64):
+    """Signature and code of an intrinsic (address of the pool's memory, cell, *values), all integers."""
 
-    def typed(typing, pool, cell, *values):
-        def emit(context, builder, signature, arguments):
-            address = builder.add(arguments[0], builder.mul(arguments[1], INT64(8)))
-            at = builder.inttoptr(address, pointer_to(INT64))
-            return emit_on(builder, at, *arguments[2:])
+    def emit(context, builder, signature, arguments):
+        address = builder.add(arguments[0], builder.mul(arguments[1], INT64(8)))
+        return emit_on(builder, builder.inttoptr(address, pointer_to(INT64)), *arguments[2:])
 
-        return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
-
-    return typed
+    return result(types.intp, types.intp, *(types.int64 for _ in values)), emit
 
 
 @intrinsic
 def _read(typing, pool, cell):
     """The number in a cell."""
-    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8, typ=INT64))(typing, pool, cell)
+    return _on_cell(lambda b, at: b.load_atomic(at, "seq_cst", 8, typ=INT64))
 
 
 @intrinsic
 def _write(typing, pool, cell, value):
     """Write a number into a cell; returns the previous one."""
-    return _on_cell(lambda b, at, value: b.atomic_rmw("xchg", at, value, "seq_cst"))(typing, pool, cell, value)
+    return _on_cell(lambda b, at, value: b.atomic_rmw("xchg", at, value, "seq_cst"), value)
 
 
 @intrinsic
 def _add(typing, pool, cell, value):
     """Add a number to a cell; returns the previous one."""
-    return _on_cell(lambda b, at, value: b.atomic_rmw("add", at, value, "seq_cst"))(typing, pool, cell, value)
+    return _on_cell(lambda b, at, value: b.atomic_rmw("add", at, value, "seq_cst"), value)
 
 
 @intrinsic
@@ -86,7 +87,28 @@ def _replace(typing, pool, cell, old, new):
     def emit(builder, at, old, new):
         return builder.extract_value(builder.cmpxchg(at, old, new, "seq_cst", "seq_cst"), 1)
 
-    return _on_cell(emit, types.boolean)(typing, pool, cell, old, new)
+    return _on_cell(emit, old, new, result=types.boolean)
+
+
+def _python_function(name: str, *more: ir.Constant):
+    """An intrinsic (address of a lock) that calls a C function of Python which does not need Python's lock."""
+
+    def typed(typing, lock):
+        def emit(context, builder, signature, arguments):
+            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [INT64, *(one.type for one in more)])
+            function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+            builder.call(function, [arguments[0], *more])
+            return context.get_dummy_value()
+
+        return types.void(types.int64), emit
+
+    return intrinsic(typed)
+
+
+#: Sleep until a lock is released, once for each release.
+_sleep = _python_function(ACQUIRE, ir.IntType(32)(1))
+#: Wake the thread that sleeps on a lock.
+_wake = _python_function(RELEASE)
 
 
 @intrinsic
@@ -102,43 +124,20 @@ def _pause(typing):
     return types.void(), emit
 
 
-def _python_function(name: str, *more: ir.Constant):
-    """An intrinsic (address of a lock) that calls a C function of Python which does not need Python's lock."""
-
-    def typed(typing, lock):
-        def emit(context, builder, signature, arguments):
-            kind = ir.FunctionType(ir.IntType(32) if more else ir.VoidType(), [INT64, *(one.type for one in more)])
-            function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-            builder.call(function, [arguments[0], *more])
-            return context.get_dummy_value()
-
-        return types.void(types.int64), emit
-
-    return typed
-
-
-@intrinsic
-def _sleep(typing, lock):
-    """Sleep until the lock is released, once for each release."""
-    return _python_function(ACQUIRE, ir.IntType(32)(1))(typing, lock)
-
-
-@intrinsic
-def _wake(typing, lock):
-    """Wake the thread that sleeps on a lock."""
-    return _python_function(RELEASE)(typing, lock)
-
-
 @intrinsic
 def call_address(typing, address, task_arguments, block):
-    """Call the task at an address with the address of its arguments (a `NumbaStruct` has one) and a block."""
+    """Call the task at an address with a block and with arguments, or their address (a `NumbaStruct` has one)."""
 
     def emit(context, builder, signature, arguments):
+        address, content, block = arguments
+        if not isinstance(content.type, ir.IntType):
+            content = builder.ptrtoint(content, INT64)
         kind = ir.FunctionType(ir.VoidType(), [INT64, INT64])
-        builder.call(function_at(builder, arguments[0], kind), arguments[1:])
+        builder.call(function_at(builder, address, kind), [content, block])
         return context.get_dummy_value()
 
-    return types.void(types.intp, types.intp, types.intp), emit
+    content = types.intp if isinstance(task_arguments, types.Integer) else task_arguments
+    return types.void(types.intp, content, types.intp), emit
 
 
 @kernel(count_references=False)
@@ -262,7 +261,7 @@ class _ThreadPool:
         """Compile the loops of the pool, or read them from the cache, and start the missing workers."""
         with self._starting:
             if not self.code:
-                options = compiler_options(False) | reference_counting(False)
+                options = compiler_options(count_references=False)
                 self.code = [
                     compile_callback(function, (types.int64,) * count, options)
                     for function, count in ((_run_task, 4), (_run_worker, 2), (_poll, 2))
@@ -294,11 +293,8 @@ class _ThreadPool:
 
     def _polls(self) -> int:
         """Number of polls in `POLLING_TIME`."""
-        poll, count, fastest = self._c_function(2), 500, float("inf")
-        for _ in range(3):
-            began = time.perf_counter()
-            poll(self.cells.ctypes.data, count)
-            fastest = min(fastest, time.perf_counter() - began)
+        poll, count = self._c_function(2), 500
+        fastest = min(timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3))
         return max(1, int(count * POLLING_TIME / fastest))
 
     def reset_after_fork(self) -> None:
@@ -325,9 +321,8 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.reset_after_fork)
 
 
-def start_workers() -> None:
-    """Start the thread pool at the first call; calling threads can then use it."""
-    _pool.start()
+#: Starts the thread pool at the first call; calling threads can then use it.
+start_workers = _pool.start
 
 
 def set_threads(count: int) -> None:

@@ -43,35 +43,29 @@ class Example(NamedTuple):
 
 
 def examples() -> list[Example]:
-    """The shipped scenes, sorted by name."""
-    found = []
-    for path in sorted(SYSTEMS.glob("*.toml")):
-        text = path.read_text(encoding="utf-8")
-        about = text.partition("\n")[0].removeprefix("# ")
-        found.append(Example(path.stem, path, about, "body" in tomllib.loads(text)))
-    return sorted(found, key=_natural_order)
+    """The shipped scenes, sorted by name; numbers within names are sorted by value."""
+    found = _examples(SYSTEMS.glob("*.toml"))
+    return sorted(found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)])
 
 
 def notebooks() -> list[Example]:
     """The shipped notebooks, sorted by name."""
-    found = []
-    for path in sorted((SYSTEMS / "notebooks").glob(f"*{NOTEBOOK}")):
-        first = json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"]
-        found.append(Example(path.stem, path, "".join(first).partition("\n")[0].removeprefix("# ")))
-    return found
+    return _examples((SYSTEMS / "notebooks").glob(f"*{NOTEBOOK}"))
 
 
 def scripts() -> list[Example]:
     """The shipped scripts, each an extension, sorted by name."""
-    return [
-        Example(path.stem, path, path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# "))
-        for path in sorted((SYSTEMS / "scripts").glob(f"*{SCRIPT}"))
-    ]
+    return _examples((SYSTEMS / "scripts").glob(f"*{SCRIPT}"))
 
 
-def _natural_order(example: Example) -> list:
-    """Sort key that orders numbers within names by value."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", example.name)]
+def _examples(paths: Iterable[Path]) -> list[Example]:
+    found = []
+    for path in sorted(paths):
+        text = path.read_text(encoding="utf-8")
+        is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
+        first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == NOTEBOOK else text
+        found.append(Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body))
+    return found
 
 
 def find_example(name: str) -> Example:

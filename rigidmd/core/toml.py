@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from tomllib import TOMLDecodeError
-from typing import Any, NamedTuple
+from typing import Any
 
 from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import UNPRINTABLE, InputError
@@ -143,30 +143,24 @@ def describe_toml_error(error: TOMLDecodeError, text: str) -> str:
 
 def line_of(keys: list, text: str) -> int | None:
     """Line (from 1) where a TOML text sets a path of keys, or opens the nearest table around it; else None."""
-    index, parts = _index(text), tuple(keys)
-    heads = [parts[:n] for n in range(1, len(parts) + 1)]
-    entries = [index.entries[head] for head in heads if head in index.entries]
-    if entries:
-        return min(entries)
-    return max((index.tables[head] for head in heads if head in index.tables), default=None)
-
-
-class _Index(NamedTuple):
-    """Lines (counted from 1) of a TOML text."""
-
-    entries: dict[tuple, int]  # the first line that sets a path of keys
-    tables: dict[tuple, int]  # the last line that opens a table
+    entries, tables = _index(text)
+    heads = [tuple(keys[:n]) for n in range(1, len(keys) + 1)]
+    if set_at := [entries[head] for head in heads if head in entries]:
+        return min(set_at)
+    return max((tables[head] for head in heads if head in tables), default=None)
 
 
 @lru_cache(maxsize=2)
-def _index(text: str) -> _Index:
-    found = _Index({}, {})
+def _index(text: str) -> tuple[dict[tuple, int], dict[tuple, int]]:
+    """Lines (from 1) of a TOML text: the first that sets each path of keys, and the last that opens each table."""
+    entries: dict[tuple, int] = {}
+    tables: dict[tuple, int] = {}
     for number, table, entry in _lines(text):
         if entry:
-            found.entries.setdefault((*table, *entry), number)
+            entries.setdefault((*table, *entry), number)
         else:
-            found.tables[tuple(table)] = number
-    return found
+            tables[tuple(table)] = number
+    return entries, tables
 
 
 def _lines(text: str) -> Iterator[tuple[int, list, list[str]]]:

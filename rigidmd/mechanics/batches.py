@@ -5,9 +5,9 @@ In rotations each lane has a body: for a single body, each factor of a rotation 
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import align_stack, broadcast, lane_count, load, mask_bits, select, store, sum_lanes
-from rigidmd.compile.simd_records import load_matrices, load_vectors, store_matrices, store_vectors
+from rigidmd.compile.simd_memory import load_matrices, load_vectors, store_matrices, store_vectors
 from rigidmd.mechanics.free_rotor import SHORT_ANGLE2, SplitRotor, rotate, rotate_vector, rotation_coefficient_series
 
 LANES = lane_count(np.float64)  # bodies that are rotated together
@@ -163,17 +163,11 @@ def _square_gain(before, after):
     )
 
 
+@chosen_by_type
 def rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h):
     """`free_rotor.rotate` for molecules first ... end - 1."""
-    raise TypeError("compiled code only")
-
-
-@implements(rotate_group)
-def _rotate_group(rotor, species, rotation, angular_momentum_body, first, end, h):
     if not is_a(rotor, SplitRotor):
-        return lambda rotor, species, rotation, angular_momentum_body, first, end, h: _rotate_one_by_one(
-            rotor, species, rotation, angular_momentum_body, first, end, h
-        )
+        return _rotate_one_by_one.py_func
 
     def rotate_together(rotor, species, rotation, angular_momentum_body, first, end, h):
         align_stack()

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
 from rigidmd.mechanics.time_functions import TimeFunction, rate, value
 
@@ -32,7 +32,7 @@ class SplitRotor(NamedTuple):
     """
 
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
-    symmetry: np.ndarray  # (species,) ROUND, or the axis of symmetry 0, 1, 2, or NONE
+    symmetry: np.ndarray  # (species,) SPHERICAL, or the axis of symmetry 0, 1, 2, or NO_SYMMETRY
     common: np.ndarray  # (species,) g
     excess: np.ndarray  # (species, 3) 1/I - g; 0 for linear bodies, which have no momentum along their axis
     order: np.ndarray  # (species, 3) axes a, b, c
@@ -106,24 +106,13 @@ class NoRotor(NamedTuple):
     inverse_inertia: float = 0.0
 
 
+@chosen_by_type(inline=True)
 def rotate(rotor, species, rotation, angular_momentum_body, m, h):
     """Rotate molecule m of the given species freely for a time h: Q' = Q hat(I^-1 L), L' = L x I^-1 L, in place."""
-    raise TypeError(f"{type(rotor).__name__} is not a rotor, or this was called outside compiled code")
-
-
-@implements(rotate, NoRotor, inline=True)
-def _rotate_points(rotor, species, rotation, angular_momentum_body, m, h):
-    return None
-
-
-@implements(rotate, inline=True)
-def _rotate_by_type(rotor, species, rotation, angular_momentum_body, m, h):
+    if is_a(rotor, NoRotor):
+        return lambda rotor, species, rotation, angular_momentum_body, m, h: None
     if is_a(rotor, SplitRotor):
-
-        def rotate_split(rotor, species, rotation, angular_momentum_body, m, h):
-            rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h)
-
-        return rotate_split
+        return rotate_by_splitting.py_func
     if is_a(rotor, ExactRotor):
 
         def rotate_exact(rotor, species, rotation, angular_momentum_body, m, h):
@@ -313,26 +302,18 @@ def rotate_by_vector(rotation, x, y, z):
     rotate_rows(rotation, x, y, z, -odd, even)
 
 
+@chosen_by_type(inline=True)
 def rotate_body(rotor, state, time, h):
     """Rotate a single body freely from `time` to time + h, in place."""
-    raise TypeError("compiled code only")
-
-
-@implements(rotate_body, inline=True)
-def _rotate_body(rotor, state, time, h):
     if not is_a(rotor, DrivenRotor):
         return lambda rotor, state, time, h: rotate(rotor, 0, state.rotation, state.angular_momentum_body, 0, h)
 
     def rotate_driven(rotor, state, time, h):
-        L = state.angular_momentum_body
+        L, inertia, carried = state.angular_momentum_body, rotor.inertia, rotor.momentum
         before = driven_energy(rotor, L, time)
         middle = time + 0.5 * h
-        inverse = (
-            1 / value(rotor.inertia, middle, 0),
-            1 / value(rotor.inertia, middle, 1),
-            1 / value(rotor.inertia, middle, 2),
-        )
-        offset = (value(rotor.momentum, middle, 0), value(rotor.momentum, middle, 1), value(rotor.momentum, middle, 2))
+        inverse = 1 / value(inertia, middle, 0), 1 / value(inertia, middle, 1), 1 / value(inertia, middle, 2)
+        offset = value(carried, middle, 0), value(carried, middle, 1), value(carried, middle, 2)
         state.energy_ledger[WORK] += driven_energy(rotor, L, middle) - before
         rotate_about_axes(state.rotation, L, 0, (0, 1, 2), inverse, offset, h)
         state.energy_ledger[WORK] += driven_energy(rotor, L, time + h) - driven_energy(rotor, L, middle)
@@ -350,13 +331,9 @@ def driven_energy(rotor, angular_momentum_body, time):
     return energy
 
 
+@chosen_by_type(inline=True)
 def moments(rotor, time, k):
     """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 for an axis without inertia."""
-    raise TypeError("compiled code only")
-
-
-@implements(moments, inline=True)
-def _moments(rotor, time, k):
     if is_a(rotor, SplitRotor) or is_a(rotor, ExactRotor):
         return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
     if is_a(rotor, DrivenRotor):
@@ -365,22 +342,14 @@ def _moments(rotor, time, k):
         return lambda rotor, time, k: (0.0, 0.0)
 
 
-def moment_rates(rotor, time, k) -> tuple[float, float, float, float]:
+@chosen_by_type(inline=True)
+def moment_rates(rotor, time, k):
     """(I_k, I_k', h_k, h_k') of a single body's rotor at a time."""
-    raise TypeError("compiled code only")
-
-
-@implements(moment_rates, inline=True)
-def _moment_rates(rotor, time, k):
     if is_a(rotor, DrivenRotor):
 
         def driven(rotor, time, k):
-            return (
-                value(rotor.inertia, time, k),
-                rate(rotor.inertia, time, k),
-                value(rotor.momentum, time, k),
-                rate(rotor.momentum, time, k),
-            )
+            inertia, carried = rotor.inertia, rotor.momentum
+            return value(inertia, time, k), rate(inertia, time, k), value(carried, time, k), rate(carried, time, k)
 
         return driven
 

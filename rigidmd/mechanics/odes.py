@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import chosen_by_type, is_a
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion
 
 
@@ -47,13 +47,9 @@ def attitude_variables(form: AttitudeForm, rotation: np.ndarray) -> np.ndarray:
     return {Matrix: np.ravel, Quaternion: to_quaternion, EulerAngles: to_euler_angles}[type(form)](rotation[0])
 
 
+@chosen_by_type(inline=True)
 def write_rotation(form, y, rotation):
     """Write Q (1, 3, 3) from the variables, without normalisation: Q of a quaternion is |q|² times a rotation."""
-    raise TypeError("compiled code only")
-
-
-@implements(write_rotation, inline=True)
-def _write_rotation(form, y, rotation):
     if is_a(form, NoAttitude):
         return lambda form, y, rotation: None
     if is_a(form, Matrix):
@@ -99,13 +95,9 @@ def _write_rotation(form, y, rotation):
     return from_euler_angles
 
 
+@chosen_by_type(inline=True)
 def attitude_rates(form, y, w0, w1, w2, rates):
     """Write the rates of the attitude variables for an angular velocity along the body's axes."""
-    raise TypeError("compiled code only")
-
-
-@implements(attitude_rates, inline=True)
-def _attitude_rates(form, y, w0, w1, w2, rates):
     if is_a(form, NoAttitude):
         return lambda form, y, w0, w1, w2, rates: None
     if is_a(form, Matrix):

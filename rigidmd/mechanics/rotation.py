@@ -96,21 +96,6 @@ def from_yaw_pitch_roll(yaw_pitch_roll: np.ndarray) -> np.ndarray:
     )
 
 
-def to_yaw_pitch_roll(rotation: np.ndarray) -> np.ndarray:
-    """3-2-1 angles (..., 3) of Q (..., 3, 3): yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2].
-
-    Where cos(pitch) is 0, only yaw - roll (pitch = pi/2) or yaw + roll (pitch = -pi/2) is defined, and roll is set to
-    0. Nearby, yaw is limited by rounding; roll follows from Rz(-yaw) Q.
-    """
-    q = np.asarray(rotation, dtype=float)
-    cos_pitch = np.hypot(q[..., 0, 0], q[..., 1, 0])
-    locked = cos_pitch == 0
-    yaw = np.where(locked, _angle(-q[..., 0, 1], q[..., 1, 1]), _angle(q[..., 1, 0], q[..., 0, 0]))
-    row = np.cos(yaw)[..., None] * q[..., 1, :] - np.sin(yaw)[..., None] * q[..., 0, :]  # (0, cos roll, -sin roll)
-    roll = np.where(locked, 0.0, _angle(-row[..., 2], row[..., 1]))
-    return np.stack([yaw, np.arctan2(-q[..., 2, 0], cos_pitch), roll], axis=-1) + 0.0  # + 0.0: no -0
-
-
 def hat(vector: np.ndarray) -> np.ndarray:
     """Skew matrices (..., 3, 3) of vectors (..., 3): hat(a) b = a x b, so that dQ/dt = Q hat(omega_body)."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=float), -1, 0)

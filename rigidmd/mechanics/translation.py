@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.mechanics.free_rotor import rotate_body
 
 
@@ -35,13 +35,9 @@ class FluidTranslation(NamedTuple):
     inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
 
 
+@chosen_by_type(inline=True)
 def translate(translation, rotor, state, time, h):
     """Flow of the kinetic energy of a single body, from `time` to time + h, in place."""
-    raise TypeError("compiled code only")
-
-
-@implements(translate, inline=True)
-def _translate(translation, rotor, state, time, h):
     if is_a(translation, NoTranslation):
         return lambda translation, rotor, state, time, h: rotate_body(rotor, state, time, h)
     if is_a(translation, FreeTranslation):
@@ -84,13 +80,9 @@ def body_component(rotation, vector_lab, k):
     return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
 
 
+@chosen_by_type(inline=True)
 def inertial_mass(translation, k):
     """Mass, with added mass, for motion along body axis k."""
-    raise TypeError("compiled code only")
-
-
-@implements(inertial_mass, inline=True)
-def _inertial_mass(translation, k):
     if is_a(translation, FluidTranslation):
         return lambda translation, k: translation.inertial_mass[k]
     return lambda translation, k: translation.mass

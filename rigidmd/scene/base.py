@@ -1,5 +1,6 @@
 """The base class of scenes: reading one from a TOML file or a dictionary, and setting single keys of it."""
 
+# isort: skip_file
 import os
 import re
 from collections.abc import Iterable
@@ -13,27 +14,14 @@ from rigidmd.core.files import unreadable_reason
 from rigidmd.core.integrators import SCHEMES, Scheme
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
-    DEEPEST,
-    TOMLDecodeError,
-    impossible_values,
-    parse_toml,
-    parse_whole_number,
-    plain_values,
-    read_toml,
-    shorten_repr,
-)
+    DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
+)  # fmt: skip
 from rigidmd.errors import SceneError
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
-    MOST_TABLES,
-    Section,
-    did_you_mean,
-    location_of,
-    numbers_out_of_range,
-    similar_names,
-    suggestion,
+    MOST_TABLES, Section, did_you_mean, location_of, numbers_out_of_range, similar_names, suggestion,
     validation_messages,
-)
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from rigidmd.scene.body import BodyScene

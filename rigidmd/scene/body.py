@@ -3,6 +3,7 @@
 The equations contain no physical constants, so any other consistent units work as well.
 """
 
+# isort: skip_file
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,28 +13,14 @@ from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY, written
 from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
-    angular_velocity_of_euler_rates,
-    from_attitude_matrix,
-    from_euler_angles,
-    from_quaternion,
-    from_yaw_pitch_roll,
-    nearest_rotation,
-    orthogonality_error,
-    unit_vector,
-)
+    angular_velocity_of_euler_rates, from_attitude_matrix, from_euler_angles, from_quaternion, from_yaw_pitch_roll,
+    nearest_rotation, orthogonality_error, unit_vector,
+)  # fmt: skip
 from rigidmd.mechanics.solids import COMPONENTS_PER_DIMENSION, SOLIDS
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.body_forces import (
-    Applied,
-    ChangingInertia,
-    Fluid,
-    Frame,
-    Friction,
-    Gravity,
-    NonNegativeVector,
-    PositiveVector,
-    Wheel,
-)
+    Applied, ChangingInertia, Fluid, Frame, Friction, Gravity, NonNegativeVector, PositiveVector, Wheel,
+)  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.limits import BodyWatch
 from rigidmd.scene.validation import MOST_TABLES, Flag, NameIn, Number, Positive, Section, Vector, location_of
@@ -45,6 +32,8 @@ Quaternion = tuple[Number, Number, Number, Number]
 LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
+#: Keys of [body] that give the inertia, of which a body has at most one.
+WAYS_OF_INERTIA = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
 
 #: Moments of inertia are equal, for a picture, if they differ by less than this fraction of the largest.
 EQUAL_MOMENTS = 1e-6
@@ -117,26 +106,24 @@ class BodyTable(Section):
     """Centre of mass of a pinned body, from the pivot, along the body axes"""
 
     def _errors(self):
-        faults = []
-        ways = [key for key in ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2") if getattr(self, key)]
-        if len(ways) > 1:
-            faults.append(f"give one of {', '.join(ways)}")
-        if self.points is None and self.mass_kg is None:
-            faults.append("mass_kg is missing")
-        if self.points is not None and self.mass_kg is not None:
-            faults.append("mass_kg would do nothing: the points have masses")
-        if not self.pinned and self.centre_of_mass_m is not None:
-            faults.append("centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned")
-        if self.points is not None and self.centre_of_mass_m is not None:
-            faults.append("centre_of_mass_m would do nothing: it follows from the points")
-        if self.inertia_about == "pivot":
-            if not ways:
-                faults.append("inertia_about = 'pivot', but no inertia is given")
-            if not self.pinned:
-                faults.append("inertia_about = 'pivot', but the body is not pinned")
-            if ways and ways[0] in ("solid", "points"):
-                faults.append(f"inertia_about would do nothing with {ways[0]}")
-        return faults or self._impossible()
+        ways = [key for key in WAYS_OF_INERTIA if getattr(self, key)]
+        has_points, has_centre = self.points is not None, self.centre_of_mass_m is not None
+        about_pivot, has_mass = self.inertia_about == "pivot", self.mass_kg is not None
+        faults = {
+            f"give one of {', '.join(ways)}": len(ways) > 1,
+            "mass_kg is missing": not (has_points or has_mass),
+            "mass_kg would do nothing: the points have masses": has_points and has_mass,
+            "centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned": (
+                has_centre and not self.pinned
+            ),
+            "centre_of_mass_m would do nothing: it follows from the points": has_centre and has_points,
+            "inertia_about = 'pivot', but no inertia is given": about_pivot and not ways,
+            "inertia_about = 'pivot', but the body is not pinned": about_pivot and not self.pinned,
+            f"inertia_about would do nothing with {''.join(ways[:1])}": (
+                about_pivot and ways[:1] in (["solid"], ["points"])
+            ),
+        }
+        return [fault for fault, is_there in faults.items() if is_there] or self._impossible()
 
     def _impossible(self) -> list[str]:
         tensor = self.tensor
@@ -144,15 +131,13 @@ class BodyTable(Section):
             return []
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
             return ["inertia_tensor_kg_m2 is not symmetric"]
+        if why := inertia_error(tensor):
+            return [f"no body has this inertia: {why}"]
         if self.inertia_about == "pivot":
-            if why := inertia_error(tensor):
-                return [f"no body has this inertia: {why}"]
             at_centre = shifted_inertia(tensor, -self.mass_kg, np.array(self.centre_of_mass_m or (0, 0, 0)))
             if why := inertia_error(at_centre, np.abs(tensor).max()):
                 return [f"no body of this mass has this inertia about its pivot: about its centre of mass {why}"]
-            return []
-        why = inertia_error(tensor)
-        return [f"no body has this inertia: {why}"] if why else []
+        return []
 
     @property
     def tensor(self) -> np.ndarray | None:
@@ -160,6 +145,16 @@ class BodyTable(Section):
         if self.inertia_tensor_kg_m2 is not None:
             return np.array(self.inertia_tensor_kg_m2)
         return None if self.inertia_kg_m2 is None else np.diag(self.inertia_kg_m2)
+
+
+#: Keys of the attitude at the start, and Q (3, 3) from each.
+ATTITUDES = {
+    "euler_angles_deg": lambda angles: from_euler_angles(np.radians(angles)),
+    "yaw_pitch_roll_deg": lambda angles: from_yaw_pitch_roll(np.radians(angles)),
+    "quaternion_wxyz": lambda quaternion: from_quaternion(unit_vector(quaternion)),
+    "rotation": nearest_rotation,
+    "attitude_matrix": lambda matrix: nearest_rotation(from_attitude_matrix(matrix)),
+}
 
 
 class BodyStart(Section):
@@ -189,9 +184,8 @@ class BodyStart(Section):
     """Velocity of the centre of mass of a body that is not pinned"""
 
     def _errors(self):
-        attitudes = ("euler_angles_deg", "yaw_pitch_roll_deg", "quaternion_wxyz", "rotation", "attitude_matrix")
         spins = ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")
-        for keys in (attitudes, spins):
+        for keys in (ATTITUDES, spins):
             given = [key for key in keys if getattr(self, key) is not None]
             if len(given) > 1:
                 yield f"give one of {', '.join(given)}"
@@ -220,17 +214,8 @@ class BodyStart(Section):
     @property
     def attitude(self) -> np.ndarray:
         """Q (3, 3), a rotation to rounding."""
-        if self.euler_angles_deg is not None:
-            return from_euler_angles(np.radians(self.euler_angles_deg))
-        if self.yaw_pitch_roll_deg is not None:
-            return from_yaw_pitch_roll(np.radians(self.yaw_pitch_roll_deg))
-        if self.quaternion_wxyz is not None:
-            return from_quaternion(unit_vector(np.array(self.quaternion_wxyz)))
-        if self.rotation is not None:
-            return nearest_rotation(np.array(self.rotation))
-        if self.attitude_matrix is not None:
-            return nearest_rotation(from_attitude_matrix(np.array(self.attitude_matrix)))
-        return np.eye(3)
+        given = [(to_rotation, getattr(self, key)) for key, to_rotation in ATTITUDES.items()]
+        return next((to_rotation(np.array(value)) for to_rotation, value in given if value is not None), np.eye(3))
 
     @property
     def angular_velocity(self) -> np.ndarray:
@@ -308,7 +293,6 @@ class BodyOutput(Section):
     none"""
     axis: Vector | None = None
     """Body axis whose path is drawn; default: towards the centre of mass, else the axis of symmetry, else axis 3"""
-
     drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
     """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with the mass and inertia
     of the body, or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default:
@@ -368,10 +352,9 @@ class BodyScene(Scene):
             forces = ("linear_resistance_kg_s", "quadratic_resistance_kg_m", "added_mass_kg")
             given = [key for key in forces if isinstance(fluid.get(key), list | tuple) and any(fluid[key])]
             found += [(["fluid", key], "the body is pinned at a point: no such force acts on it") for key in given]
-        ways = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
-        if "changing_inertia" in data and any(key in body for key in ways):
-            key = next(key for key in ways if key in body)
-            found.append((["body", key], "changing_inertia defines the inertia: omit one of them"))
+        given = [key for key in WAYS_OF_INERTIA if key in body]
+        if "changing_inertia" in data and given:
+            found.append((["body", given[0]], "changing_inertia defines the inertia: omit one of them"))
         if "fluid" in data and "frame" in data:
             found.append((["frame"], "a fluid at rest and an accelerated frame together are not supported"))
         return [f"{location_of(keys, text)}: {fault}" for keys, fault in found]

@@ -1,5 +1,6 @@
 """Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has published ones."""
 
+# isort: skip_file
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -12,17 +13,9 @@ from rigidmd.core.toml import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
 from rigidmd.scene.validation import (
-    Line,
-    NonNegative,
-    Number,
-    Positive,
-    Section,
-    Vector,
-    did_you_mean,
-    location_of,
-    numbers_out_of_range,
+    Line, NonNegative, Number, Positive, Section, Vector, did_you_mean, location_of, numbers_out_of_range,
     validation_messages,
-)
+)  # fmt: skip
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
 MODELS = Path(__file__).parent.parent / "models"
