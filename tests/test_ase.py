@@ -569,7 +569,7 @@ def test_a_trajectory_of_ase_holds_every_digit(traj):
         assert np.abs(frame.get_velocities() - other.get_velocities()).max() < 1e-15
         assert frame.cell.array == pytest.approx(state.cell)
     with contextlib.closing(TrajReader(folder / "trajectory.traj")) as reader:
-        positions, velocities = reader.of_sites(reader.read(2))
+        positions, velocities, _ = reader.frame(2).sites
     assert (positions == system.site_positions(states[2])).all()
     assert np.abs(velocities - system.site_velocities(states[2])).max() < 1e-12
     assert np.abs(results.rotation[3] - states[3].rotation).max() < 1e-5
