@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from fnmatch import fnmatch
 
 import pytest
 from support import BY_EXTENSION, COMPILED, ROOT
@@ -14,8 +15,8 @@ PACKAGE = ROOT / "rigidmd"
 
 #: From the bottom up: a package imports from those before it and from itself. A subpackage may have a layer of its own.
 LAYERS = (
-    "errors", "units", "core", "compile", "mechanics", "forces", "dynamics", "io.formats", "scene", "engines", "io",
-    "figures", "assemble", "run", "analysis", "view", "studies", "ase", "commands",
+    "errors", "units", "core", "engines.registry", "engines.*.options", "compile", "mechanics", "forces", "dynamics",
+    "io.formats", "scene", "engines", "io", "figures", "assemble", "run", "analysis", "view", "studies", "ase", "commands",
 )  # fmt: skip
 #: `rigidmd` itself and `python -m rigidmd` are above all packages.
 ABOVE_ALL = ("__init__", "__main__")
@@ -49,10 +50,9 @@ def name_of(path):
 
 
 def layer_of(module):
-    """The layer of a module, "" is `rigidmd` itself: the longest entry of LAYERS that its dotted name begins with."""
-    names = module.split(".")
-    found = [".".join(names[:k]) for k in range(len(names), 0, -1)]
-    return next((name for name in found if name in RANK), names[0] or "__init__")
+    """The most specific entry of LAYERS for a module; "" is `rigidmd` itself."""
+    fitting = (name for name in RANK if fnmatch(f"{module or '__init__'}.", f"{name}.*"))
+    return max(fitting, key=len, default=module.partition(".")[0])
 
 
 def package_of(path):
@@ -113,6 +113,13 @@ def build():
     inner = [(1, "rigidmd.io.formats.xtc"), (2, "rigidmd.io.formats"), (3, "rigidmd.io.trajectory"), (4, "rigidmd.io")]
     assert [message.split(":")[0] for message in upward("scene", inner)] == ["3", "4"]
     assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
+
+
+def test_a_part_of_a_package_can_be_below_it():
+    light = imports_in("from PACKAGE.engines.lammps.options import PROGRAM".replace("PACKAGE", "rigidmd"))
+    heavy = imports_in("from PACKAGE.engines.lammps.files import fixes".replace("PACKAGE", "rigidmd"))
+    assert not list(upward("scene", light)) and len(list(upward("scene", heavy))) == 1
+    assert len(list(upward("engines.*.options", heavy))) == 1
 
 
 @pytest.mark.parametrize("library", LIBRARIES)

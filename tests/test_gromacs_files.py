@@ -18,7 +18,7 @@ from support import (
     small_scene,
     write_gromacs,
 )
-from support import gromacs_unsupported as unsupported
+from support import gromacs_table as table
 
 from rigidmd.errors import SceneError
 from rigidmd.units import KJ_PER_MOL
@@ -151,7 +151,7 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     ]
     counts = {"spce": 4, "methanol_trappe": 2, "methane_opls": 2}
     system = build(small_scene(counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}))
-    told = " ".join(unsupported(force_field_of(system)))
+    told = " ".join(table.refusals(force_field_of(system)))
     for words in (
         "smooth_switch", "with reaction_field", "no rigid bodies whose mass", "one kind of triangle", "andersen",
         "monte_carlo", "yoshida_4",

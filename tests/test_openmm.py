@@ -29,7 +29,7 @@ from support import (
     small_scene,
     write_openmm,
 )
-from support import openmm_unsupported as unsupported
+from support import openmm_table as table
 
 from rigidmd.commands import cli
 from rigidmd.errors import EngineError, SceneError
@@ -383,7 +383,7 @@ def test_what_openmm_cannot_do_is_told_at_once():
         {"duration_ps": 0.1, "integrator": "yoshida_4"},
     ]
     scene = small_scene({"spce": 4}, 13.0, stages=stages, **BOX)
-    told = " ".join(unsupported(force_field_of(build(scene))))
+    told = " ".join(table.refusals(force_field_of(build(scene))))
     for words in ("velocity_rescaling", "cell_rescaling", "nph", "changes over the stage", "yoshida_4"):
         assert words in told
     falling = small_scene(

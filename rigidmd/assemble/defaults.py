@@ -22,10 +22,6 @@ from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, Forces
 from rigidmd.scene.stage import Stage
 
-#: Default thermostat of external engines, because neither LAMMPS nor OpenMM has velocity rescaling of rigid bodies.
-THERMOSTAT = "nose_hoover"
-#: Default barostats of external engines; LAMMPS' barostat has no name in a scene.
-BAROSTATS = {"lammps": None, "openmm": "monte_carlo"}
 CUTOFF = 9.0  # Å, in a periodic box
 #: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy of 1e-4 gained a
 #: momentum of 26 u Å/ps; their thermal momentum is 980.
@@ -40,16 +36,18 @@ ORTHOGONALITY, ORTHOGONALITY_OF_SOLVERS = 1e-9, 0.1
 
 def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[str]]:
     """A scene with those defaults that depend on an external engine, and notes on them."""
-    if not scene.engine.is_external:
+    if (program := scene.engine.program) is None:
         return scene, []
     notes = [f"computed by {scene.engine.title}"]
     stages = []
     for k, stage in enumerate(scene.stages):
-        if stage.has_thermostat and stage.thermostat is None and not stage.thermostat_is_open:
-            notes.append(f"stages.{k}: thermostat {THERMOSTAT}, because {scene.engine.name} has no velocity_rescaling")
-            stage = stage.model_copy(update={"thermostat": THERMOSTAT})
+        if program.thermostat and stage.has_thermostat and stage.thermostat is None and not stage.thermostat_is_open:
+            notes.append(
+                f"stages.{k}: thermostat {program.thermostat}, because {program.name} has no velocity_rescaling"
+            )
+            stage = stage.model_copy(update={"thermostat": program.thermostat})
         if stage.ensemble == "npt" and stage.barostat is None:
-            stage = stage.model_copy(update={"barostat": BAROSTATS[scene.engine.name]})
+            stage = stage.model_copy(update={"barostat": program.barostat})
         stages.append(stage)
     changed: dict[str, Any] = {"stages": tuple(stages)}
     forces = scene.forces
@@ -61,9 +59,9 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
 
 
 def stage_with_defaults(scene: MolecularScene, stage: Stage) -> Stage:
-    """A stage with all defaults; LAMMPS' barostat has only a time constant."""
+    """A stage with all defaults. A barostat of an external engine without a name has only a time constant."""
     found = stage.with_defaults
-    if scene.engine.name == "lammps" and stage.ensemble == "npt" and stage.barostat is None:
+    if scene.engine.is_external and stage.ensemble == "npt" and stage.barostat is None:
         found = found.model_copy(update={"barostat": None, "barostat_interval_ps": None})
     return found
 

@@ -9,6 +9,8 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.engines.registry import engine_options, runnable
+
 
 class Command(NamedTuple):
     position: int  # in the list of `rigidmd --help`
@@ -87,13 +89,15 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def add_engine(
-    parser: argparse.ArgumentParser, known: str = "rigidmd, lammps or openmm", default: str = "the scene's"
-) -> None:
-    """Add the options that set the table [engine] of a scene."""
+def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", itself: bool = True) -> None:
+    """Add the options that set the table [engine] of a scene; itself : rigidmd is one of the engines."""
+    *names, last = [*(["rigidmd"] if itself else []), *runnable()]
+    known = f"{', '.join(names)} or {last}"
     parser.add_argument("--engine", metavar="NAME", help=f"engine to use, {known}: engine.name (default: {default})")
-    parser.add_argument("--ranks", type=int, metavar="N", help="number of MPI processes of lammps (default: 1)")
-    parser.add_argument("--platform", metavar="NAME", help="platform of openmm: CPU, Reference, CUDA, OpenCL or HIP")
+    for key, option in engine_options().items():
+        kind, metavar = (int, "N") if option.values is int else (str, "NAME")
+        text = option.description[0].lower() + option.description[1:]
+        parser.add_argument(f"--{key}", type=kind, metavar=metavar, help=text)
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -117,7 +121,7 @@ def read_scene(options: argparse.Namespace, **more):
         for path in options.trust:
             trust(path)
     overrides = dict(parse_override(text) for text in options.overrides)
-    for option, key in (("engine", "name"), ("ranks", "ranks"), ("platform", "platform")):
+    for option, key in {"engine": "name", **{key: key for key in engine_options()}}.items():
         if (value := getattr(options, option, None)) is not None:
             overrides[f"engine.{key}"] = value
     scene = Scene.read(options.scene, overrides | more)

@@ -21,9 +21,9 @@ def _check(options: argparse.Namespace) -> int:
     print(describe(scene))
     if isinstance(scene, MolecularScene) and scene.engine.is_external:
         from rigidmd.assemble.build import build
-        from rigidmd.engines.external import check_supported
+        from rigidmd.engines.external import check_engine
 
-        check_supported(build(scene))
+        print(check_engine(build(scene)))
     for warning in [] if isinstance(scene, BodyScene) else step_warnings(scene):
         warn(warning)
     return 0

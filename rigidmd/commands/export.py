@@ -5,11 +5,13 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands.arguments import add_output_folder, add_scene, command, read_scene
+from rigidmd.engines.registry import programs
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add_scene(parser)
-    parser.add_argument("--to", required=True, choices=["lammps", "openmm", "gromacs"], help="the engine")
+    names = [name for name, program in programs().items() if program.writer]
+    parser.add_argument("--to", required=True, choices=names, help="the engine")
     add_output_folder(parser, "NAME-ENGINE", "an earlier export")
 
 

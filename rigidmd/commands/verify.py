@@ -5,11 +5,14 @@ import json
 
 from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene
+from rigidmd.engines.registry import runnable
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add_scene(parser)
-    add_engine(parser, "lammps or openmm", "the scene's, or lammps; openmm on its platform Reference")
+    first, *_ = runnable()
+    precise = [f"; {name} with {key} {value}" for name, of in runnable().items() for key, value in of.precise.items()]
+    add_engine(parser, f"the scene's, or {first}{''.join(precise)}", itself=False)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -22,11 +25,12 @@ def _verify(options: argparse.Namespace) -> int:
     from rigidmd.scene import MolecularScene
     from rigidmd.studies.verify import verify
 
-    if options.engine == "openmm" and options.platform is None:
-        options.platform = "Reference"
     scene = read_scene(options)
     if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_external:
-        options.engine = "lammps"
+        options.engine, *_ = runnable()
+    if options.engine in runnable():
+        for key, value in runnable()[options.engine].precise.items():
+            setattr(options, key, getattr(options, key) or value)
         scene = read_scene(options)
     found = verify(scene)
     print(json.dumps(found.to_json(), indent=2) if options.json else found.description())

@@ -9,7 +9,9 @@ from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.engines.force_field import force_field_of
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.system import System
-from rigidmd.errors import SceneError
+from rigidmd.engines.translations import checked_view
+from rigidmd.errors import EngineError
+from rigidmd.scene.validation import not_none
 
 
 class ExternalEngine(Engine, ABC):
@@ -69,25 +71,22 @@ def same_state(one: State | None, other: State) -> bool:
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
     """The external engine of a scene, for one of its stages. Raises SceneError with all features that it lacks, and
     EngineError if it is not installed."""
+    choice, program = system.scene.engine, not_none(system.scene.engine.program)
     check_supported(system)
-    choice = system.scene.engine
-    if choice.name == "lammps":
-        from rigidmd.engines.lammps.engine import LammpsEngine
-
-        return LammpsEngine(system, stage, choice.ranks or 1)
-    from rigidmd.engines.openmm.engine import OpenmmEngine
-
-    return OpenmmEngine(system, stage, choice.platform or "CPU")
+    return program.load(program.engine)(system, stage, **choice.options)
 
 
 def check_supported(system: System) -> None:
     """Raise SceneError with all features of a scene that its external engine lacks."""
     choice = system.scene.engine
-    if not choice.is_external:
-        return
-    if choice.name == "lammps":
-        from rigidmd.engines.lammps.files import unsupported_features
-    else:
-        from rigidmd.engines.openmm.system import unsupported_features
-    if found := unsupported_features(force_field_of(system)):
-        raise SceneError(system.scene.source, [f"engine.name = {choice.name!r}: {feature}" for feature in found])
+    checked_view(system, not_none(choice.program), f"engine.name = {choice.name!r}")
+
+
+def check_engine(system: System) -> str:
+    """What is installed of the external engine of a scene. Raises SceneError with all features that it lacks."""
+    check_supported(system)
+    program = not_none(system.scene.engine.program)
+    try:
+        return program.load(program.installed)() if program.installed else ""
+    except EngineError as error:
+        return str(error)

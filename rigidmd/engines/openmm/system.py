@@ -5,7 +5,7 @@ are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
 """
 
 import re
-from math import inf, sqrt
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,18 +13,16 @@ from scipy.special import erfc
 
 from rigidmd.core.state import State
 from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
-from rigidmd.engines.force_field import ForceFieldView, common_stage_limits, unsupported_terms
+from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.mass_points import MassPoints, mass_points
+from rigidmd.engines.openmm.options import PROGRAM
+from rigidmd.engines.openmm.translations import PME_ORDER, grid_for
 from rigidmd.engines.rigid_bodies import Points, RigidBodies
 from rigidmd.errors import EngineError
-from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
-from rigidmd.forces.ewald.pme import Pme
-from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Switched, Unmodified
-from rigidmd.scene.stage import Stage
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
 NM = 0.1
 #: Relative difference of equal parameters.
 ROUNDING = 1e-12
-#: Order of OpenMM's splines.
-PME_ORDER = 5
 
 
 class Group:
@@ -50,55 +46,8 @@ def library() -> Any:
     try:
         import openmm
     except ImportError:
-        raise EngineError("OpenMM is not installed: pip install 'rigidmd[openmm]' installs it") from None
+        raise EngineError(f"OpenMM is not installed: {PROGRAM.install}") from None
     return openmm
-
-
-def unsupported_features(view: ForceFieldView) -> list[str]:
-    system, forces = view.system, view.system.scene.forces
-    found = [f"{what} is left to rigidmd" for what in unsupported_terms(system)]
-    if view.has_ewald_sum and grid_for(view, PME_ORDER) is None:
-        problem = f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the requested accuracy"
-        found.append(f"forces.electrostatics = {forces.electrostatics!r}: {problem}; request a lower one")
-    for k, stage in enumerate(system.scene.stages):
-        found += [f"stages.{k}.{feature}" for feature in _unsupported_in_stage(stage)]
-    if view.frozen.any() and any(stage.has_barostat for stage in system.scene.stages):
-        found.append("a barostat with frozen molecules: OpenMM would move them with the box")
-    return found
-
-
-def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
-    """A grid for splines of an order with the accuracy of the scene's Ewald sum: the grid of the scene if the order of
-    its splines is not higher. None if no grid reaches the accuracy."""
-    system, law = view.system, view.coulomb
-    pme = system.terms.get("coulomb_reciprocal")
-    if isinstance(pme, Pme) and pme.order <= order:
-        a, b, c = pme.grid
-        return a, b, c
-    if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
-        return None
-    counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges = charges_in(system.species, counts)
-    real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
-    error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
-    found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
-    return None if found is None else found[0]
-
-
-def _unsupported_in_stage(stage: Stage) -> list[str]:
-    if stage.is_minimisation:
-        return []  # rigidmd itself minimises
-    found = common_stage_limits(stage, "OpenMM", "molecules", "OpenMM rotates molecules by constrained distances")
-    kind = stage.thermostat_kind
-    if stage.has_thermostat and kind not in ("nose_hoover", "langevin"):
-        found.append(f"thermostat = {kind!r}: OpenMM has nose_hoover and langevin for constrained molecules")
-    if stage.ensemble == "nph":
-        found.append("ensemble = 'nph': OpenMM has no barostat without a thermostat")
-    if stage.barostat_kind == "cell_rescaling":
-        found.append("barostat = 'cell_rescaling': OpenMM moves the box by monte_carlo, which is isotropic in a scene")
-    if stage.ramps:
-        found.append("temperature_K or pressure_bar changes over the stage: OpenMM keeps them constant")
-    return found
 
 
 class Layout(NamedTuple):

@@ -1,0 +1,8 @@
+"""GROMACS for commands, which do not load its export."""
+
+from rigidmd.engines.registry import Program
+
+PROGRAM = Program(
+    "GROMACS", "GROMACS has its own package", "translations:TRANSLATIONS", writer="files:write_gromacs",
+    command="sh run.sh",
+)  # fmt: skip

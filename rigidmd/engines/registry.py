@@ -1,0 +1,60 @@
+"""The external engines: what scenes, commands and reports know of them without loading them.
+
+`engines/NAME/options.py` has a record PROGRAM for each. To add an engine, add its folder and its name in NAMES.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple
+
+#: Folders of external engines, and their names in scenes and commands.
+NAMES = ["lammps", "openmm", "gromacs"]
+
+
+class Option(NamedTuple):
+    """A key of [engine] that one engine has."""
+
+    values: type[int] | tuple[str, ...]  # the values allowed; int: whole numbers above 0
+    default: Any
+    description: str
+
+
+class Program(NamedTuple):
+    """An external engine. Objects of its folder are named as "module:object"."""
+
+    title: str
+    install: str  # how to install it
+    translations: str  # its `engines.translations.Translations`
+    engine: str = ""  # its subclass of `engines.external.ExternalEngine`; empty if it cannot be run
+    installed: str = ""  # a function that describes what is installed here
+    options: Mapping[str, Option] = {}
+    describe: Callable[..., str] = lambda **options: ""  # name and options for reports
+    option_errors: Callable[..., str] = lambda **options: ""  # a message on options that contradict each other
+    precise: Mapping[str, Any] = {}  # the options with which `rigidmd verify` compares, unless others are given
+    thermostat: str | None = None  # its default thermostat in place of rigidmd's
+    barostat: str | None = None  # likewise of npt; None if its barostat has no name in a scene
+    writer: str = ""  # its function (folder, view, state) -> names of files; empty without an export
+    command: str = ""  # that runs an exported folder
+    name: str = ""  # its folder, set by `programs`
+
+    def load(self, path: str) -> Any:
+        """An object of its folder."""
+        module, _, name = path.partition(":")
+        return getattr(import_module(f"rigidmd.engines.{self.name}.{module}"), name)
+
+
+@cache
+def programs() -> dict[str, Program]:
+    """Name of an external engine -> its record."""
+    return {name: import_module(f"rigidmd.engines.{name}.options").PROGRAM._replace(name=name) for name in NAMES}
+
+
+def runnable() -> dict[str, Program]:
+    """The engines that scenes can name."""
+    return {name: program for name, program in programs().items() if program.engine}
+
+
+def engine_options() -> dict[str, Option]:
+    """The keys of [engine] besides its name."""
+    return {key: option for program in runnable().values() for key, option in program.options.items()}
