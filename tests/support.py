@@ -306,6 +306,7 @@ HOMES = {
     "dynamics.noise": "BATCH THERMOSTAT BAROSTAT Key LATTICE MOMENTA chi_square fill_normals key_of normals philox uniforms",
     "dynamics.observables": "largest_values sums_of_state",
     "engines.cpu.engine": "BehindWallError DTYPES",
+    "engines.protocol": "NotFiniteError",
     "engines.ode.engine": "OdeEngine",
     "engines.protocol": "NotFiniteError",
     "forces.body.applied": "SteadyForce",
