@@ -6,11 +6,29 @@ Langevin has a damping time, the inverse of the friction, and its chains and pis
 frequency, in fs and atm; OpenMM has frictions and frequencies in 1/ps, and pressures in bar.
 """
 
+import subprocess
+import sys
+from dataclasses import replace
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from support import build, force_field_of, lammps_files, small_scene, write_gromacs, write_openmm
+from support import (
+    MIXED_ERROR,
+    ROOT,
+    build,
+    force_field_of,
+    lammps_files,
+    openmm_engine,
+    programs,
+    shaken,
+    small_scene,
+    write_gromacs,
+    write_openmm,
+)
+
+from rigidmd.errors import SceneError
 
 COUNTS = {"spce": 6, "nitrogen": 4}
 NVT = {"ensemble": "nvt", "temperature_K": 310.0, "duration_ps": 0.4, "timestep_fs": 2.0}
@@ -248,3 +266,199 @@ def test_openmm_has_an_integrator_for_each_stage(tmp_path):
     assert sorted(kinds) == ["CustomIntegrator", "LangevinMiddleIntegrator", "LangevinMiddleIntegrator"]
     seeds = {one.getRandomNumberSeed() for one in integrators if hasattr(one, "getFriction")}
     assert len(seeds) == 2
+
+
+# what no table has
+
+
+class Stranger(NamedTuple):
+    """A potential, or a term."""
+
+    strength: float = 1.0
+
+
+class StrangeField(NamedTuple):
+    changes_momentum: bool = True
+
+
+def with_strange(system, what):
+    """A system with something that no engine can know."""
+    stage, scene, terms = system.scene.stages[0], system.scene, dict(system.terms)
+    if what in ("thermostat", "barostat"):
+        scene = scene.model_copy(update={"stages": (stage.model_copy(update={what: "made_up"}),)})
+    elif what == "truncation":
+        scene = scene.model_copy(update={"forces": scene.forces.model_copy(update={"truncation": "made_up"})})
+    elif what == "potential":  # it took the name of the Coulomb forces of rigidmd
+        terms["coulomb"] = terms["coulomb"]._replace(potential=Stranger())
+    else:
+        terms[what] = {"field": StrangeField(), "term": Stranger()}[what]
+    return replace(system, scene=scene, terms=terms)
+
+
+@pytest.mark.parametrize("name", programs())
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("thermostat", "stages.0.thermostat = 'made_up': {}"), ("barostat", "stages.0.barostat = 'made_up': {}"),
+        ("truncation", "forces.truncation = 'made_up': {} has plain and shift and"),
+        ("potential", "coulomb: the pair potential Stranger is left to rigidmd"),
+        ("field", "field: a field is left to rigidmd"), ("term", "term: the term Stranger is left to rigidmd"),
+    ],
+)  # fmt: skip
+def test_what_no_table_has_is_refused(name, what, message):
+    stage = NPT | {"thermostat": "langevin", "integrator": "velocity_verlet"}
+    system = build(small_scene({"spce": 4}, 13.0, stages=[stage], forces={"cutoff_A": 5.0, "truncation": "shift"}))
+    program = programs()[name]
+    table = program.load(program.translations)
+    found = list(table.refusals(force_field_of(with_strange(system, what))))
+    assert any(message.format(program.title) in line for line in found), found
+    before = set(table.refusals(force_field_of(system)))
+    assert len(set(found) - before) == 1
+
+
+# the precision of OpenMM
+
+
+@pytest.mark.parametrize(
+    ("platform", "precision", "properties"),
+    [
+        ("CUDA", None, {"Precision": "mixed"}), ("OpenCL", "double", {"Precision": "double"}),
+        ("HIP", "single", {"Precision": "single"}), ("Reference", None, {}), ("CPU", None, {"Threads": "3"}),
+    ],
+)  # fmt: skip
+def test_a_gpu_has_mixed_precision_unless_the_scene_says_otherwise(platform, precision, properties):
+    assert openmm_engine.properties_of(platform, precision, 3) == properties
+    given = {"name": "openmm", "platform": platform} | ({"precision": precision} if precision else {})
+    choice = small_scene({"argon": 2}, 20.0, engine=given).engine
+    assert choice.options == {"platform": platform, "precision": precision}
+    assert ("precision" in choice.title) == ("Precision" in properties)
+
+
+def test_a_platform_with_one_precision_has_no_other():
+    for platform, precision in (("CPU", "double"), ("Reference", "single")):
+        with pytest.raises(SceneError, match=f"precision = '{precision}' is for GPUs: the platform {platform} has"):
+            small_scene({"argon": 2}, 20.0, engine={"name": "openmm", "platform": platform, "precision": precision})
+    with pytest.raises(SceneError, match="precision would do nothing with engine.name = 'lammps'; it is for openmm"):
+        small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
+
+
+def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
+    assert f"(forces to {MIXED_ERROR})" in (ROOT / "rigidmd/docs/manual.md").read_text()
+    system, ours, state = shaken(build(small_scene({"tip4p2005": 216}, 18.64, forces={"cutoff_A": 9.0})), 1, 0.2)
+    exact, found = ours.evaluate(state)[0].force, system.engine_of(system.terms, "mixed").evaluate(state)[0].force
+    error = np.sqrt(np.sum((found - exact) ** 2) / np.sum(exact**2))
+    assert 0.1 * float(MIXED_ERROR) < error < 2 * float(MIXED_ERROR)
+
+
+# a new engine
+
+OPTIONS = """
+from rigidmd.engines.registry import Option, Program
+
+PROGRAM = Program(
+    "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
+    options={"tilt": Option(int, 2, "Angle of mirror; default: 2")}, describe=lambda tilt: f"Mirror tilted by {tilt}",
+    thermostat="langevin", writer="mirror:write", command="cat mirror.txt",
+)
+"""
+MIRROR = """
+import numpy as np
+
+from rigidmd.engines.external import ExternalEngine
+from rigidmd.engines.translations import Key, Translations
+
+TABLE = Translations("Mirror", (), (Key("thermostat", {None: "", "langevin": ""}),), (), ())
+
+
+def installed():
+    return "Mirror 1.0"
+
+
+def write(folder, view, state):
+    (folder / "mirror.txt").write_text(f"{len(view.kinds)} kinds")
+    return ["mirror.txt"]
+
+
+class MirrorEngine(ExternalEngine):
+    version, error = "Mirror 1.0", 0.0
+
+    def __init__(self, system, stage, tilt):
+        super().__init__(system, stage)
+        assert tilt == 3
+        self.mirrored, self.method = system.engine(), self._stage.scheme
+
+    def evaluate(self, state):
+        load, tallies = self.mirrored.evaluate(state)
+        return load._replace(force=load.force + self.error), tallies
+
+    def memory(self):
+        return {}
+
+    def recall(self, state, memory):
+        self.forget()
+
+    def _send(self, state):
+        self.mirrored.forget()
+
+    def _run(self, state, steps, dt):
+        self.mirrored.advance(state, self.method, dt, int(state.step[0]) + steps)
+
+    def _receive(self, state):
+        pass
+"""
+SCRIPT = """
+import sys
+
+import rigidmd.engines
+from rigidmd.engines import registry
+
+rigidmd.engines.__path__.append(sys.argv[1])
+registry.NAMES.append("mirror")
+
+from rigidmd.commands import cli
+
+if sys.argv[2] == "wrong":
+    from rigidmd.engines.mirror.mirror import MirrorEngine
+
+    MirrorEngine.error = 0.1
+sys.exit(cli.main(sys.argv[3:]))
+"""
+
+
+def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
+    folder = tmp_path / "engines" / "mirror"
+    folder.mkdir(parents=True)
+    for name, text in (("__init__", ""), ("options", OPTIONS), ("mirror", MIRROR)):
+        (folder / f"{name}.py").write_text(text)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    scene = tmp_path / "argon.toml"
+    scene.write_text(
+        "[box]\nlengths_A = 16.0\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[forces]\ncutoff_A = 7.0\n"
+        "[start]\ntemperature_K = 90.0\n[[stages]]\nduration_ps = 0.02\n"
+    )
+
+    def run(*arguments, error="right"):
+        command = [sys.executable, tmp_path / "script.py", folder.parent, error, *arguments]
+        return subprocess.run([*map(str, command)], capture_output=True, text=True, cwd=tmp_path, check=False)
+
+    there = ("--engine", "mirror", "--tilt", "3")
+    done = run("run", scene, *there, "-o", "out")
+    assert done.returncode == 0 and "computed by Mirror tilted by 3" in done.stdout, done.stderr
+    assert '"engine": "Mirror 1.0"' in (tmp_path / "out" / "summary.json").read_text()
+    assert run("resume", "out", "--until", "0.03ps").returncode == 0
+    wrong = run("run", scene, *there, "-o", "wrong", error="wrong")
+    assert wrong.returncode == 2 and "mirror and rigidmd do not agree at the start" in wrong.stderr
+    checked = run("check", scene, *there)
+    assert checked.returncode == 0 and checked.stdout.rstrip().endswith("Mirror 1.0")
+    assert run("verify", scene, *there).returncode == 0
+    andersen = ("stages.0.ensemble=nvt", "stages.0.temperature_K=90", "stages.0.thermostat=andersen")
+    refused = run("check", scene, *there, *(part for change in andersen for part in ("--set", change)))
+    assert "engine.name = 'mirror': stages.0.thermostat = 'andersen': Mirror has langevin" in refused.stderr
+    refused = run("check", scene, "--engine", "lammps", "--tilt", "3")
+    assert "tilt would do nothing with engine.name = 'lammps'; it is for mirror" in refused.stderr
+    assert run("export", scene, "--to", "mirror", "-o", "exported").returncode == 0
+    assert (tmp_path / "exported" / "mirror.txt").read_text() == "1 kinds"
+    schema = run("schema").stdout
+    assert '"mirror"' in schema and '"Angle of mirror; default: 2"' in schema
+    text = run("run", "--help").stdout
+    assert "rigidmd, lammps, openmm or mirror" in text and "--tilt N" in text

@@ -42,23 +42,24 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     kinetic = sum(kinetic_energies(system, state))
     size = sum(abs(ours.components[name]) for name in system.terms if name in ours.components) + kinetic
     size = max(size, virial / STEEPEST)
+    plain = PLAIN + there.force_tolerance
     force_error, sites, alpha = system.force_error or 0.0, system.site_count, system.scene.forces.ewald_alpha_per_A
     ewald = force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     lines = []
     for name in {**ours.components, **theirs.components}:
         a, b = (seen.components.get(name, 0.0) for seen in (ours, theirs))
-        tolerance = PLAIN * size + (ewald if name.startswith("coulomb") else 0.0)
+        tolerance = plain * size + (ewald if name.startswith("coulomb") else 0.0)
         lines.append(_energy(name.replace("_", " "), a, b, tolerance))
-    lines.append(_energy("potential energy", ours.potential, theirs.potential, PLAIN * size + ewald))
+    lines.append(_energy("potential energy", ours.potential, theirs.potential, plain * size + ewald))
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
     for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
         if len(ours.load[k]):
             title, pair = f"rms {name} on a molecule", (ours.load[k], theirs.load[k])
-            lines.append(_of_bodies(title, unit, *pair, tolerance, size, system))
+            lines.append(_of_bodies(title, unit, *pair, tolerance, plain, size, system))
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
-        lines.append(_energy("virial", a, b, PLAIN * max(size, virial) + 3 * ewald))
+        lines.append(_energy("virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald))
     return lines
 
 
@@ -67,12 +68,13 @@ def _energy(name: str, here: float, there: float, tolerance: float) -> Compariso
 
 
 def _of_bodies(
-    name: str, unit: str, here: np.ndarray, there: np.ndarray, tolerance: float, size: float, system: System
-) -> Comparison:
+    name: str, unit: str, here: np.ndarray, there: np.ndarray, tolerance: float, plain: float, size: float,
+    system: System
+) -> Comparison:  # fmt: skip
     """Rms over bodies. The tolerance is relative to it, or to the energy of a body where it nearly vanishes."""
     rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (here, there, there - here)]
     scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if "Å" in unit else 1.0))
-    return Comparison(name, unit, *(x / KJ_PER_MOL for x in (*rms, PLAIN * scale + tolerance)))
+    return Comparison(name, unit, *(x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance)))
 
 
 def describe_comparison(lines: list[Comparison], there: str) -> str:

@@ -36,7 +36,9 @@ class Engine(Protocol):
     """Whether steps from an earlier state are repeated to the same bits, and evaluations at other states leave no trace
     in the motion and are cheap"""
     force_tolerance: float = 0.0
-    """Relative error of forces by the arithmetic of the engine"""
+    """Relative error of energies and of rms forces by the arithmetic of the engine"""
+    virial_tolerance: float = 0.0
+    """Relative error of the virial by the method of the engine"""
     length_tolerance: float = 0.0
     """Relative error of distances within molecules"""
     load: Load | None = None
