@@ -278,7 +278,7 @@ HOMES = {
     "io.formats.atoms": "Frame element_of element_of_mass",
     "assemble.body": "build_body",
     "io.formats.cells": "describe_basis basis_of pairs_within reduced_cell standard_rotation",
-    "assemble.describe": "describe",
+    "assemble.describe": "MIXED_ERROR describe",
     "io.formats": "BY_EXTENSION",
     "io.formats.gsd": "GsdFile GsdReader",
     "dynamics.momenta": "draw_momenta mobile remove_momentum",

@@ -338,7 +338,7 @@ def test_a_platform_with_one_precision_has_no_other():
     for platform, precision in (("CPU", "double"), ("Reference", "single")):
         with pytest.raises(SceneError, match=f"precision = '{precision}' is for GPUs: the platform {platform} has"):
             small_scene({"argon": 2}, 20.0, engine={"name": "openmm", "platform": platform, "precision": precision})
-    with pytest.raises(SceneError, match="precision would do nothing with engine.name = 'lammps'; it is for openmm"):
+    with pytest.raises(SceneError, match=r"precision would do nothing with engine.name = 'lammps'; it is for openmm"):
         small_scene({"argon": 2}, 20.0, engine={"name": "lammps", "precision": "mixed"})
 
 
