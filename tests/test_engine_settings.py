@@ -352,8 +352,9 @@ def test_the_error_of_mixed_precision_is_the_one_in_the_manual():
 
 # a new engine
 
+#: PACKAGE is rigidmd; test_support.py would take these imports for ours.
 OPTIONS = """
-from rigidmd.engines.registry import Option, Program
+from PACKAGE.engines.registry import Option, Program
 
 PROGRAM = Program(
     "Mirror", "it needs nothing", "mirror:TABLE", engine="mirror:MirrorEngine", installed="mirror:installed",
@@ -364,8 +365,8 @@ PROGRAM = Program(
 MIRROR = """
 import numpy as np
 
-from rigidmd.engines.external import ExternalEngine
-from rigidmd.engines.translations import Key, Translations
+from PACKAGE.engines.external import ExternalEngine
+from PACKAGE.engines.translations import Key, Translations
 
 TABLE = Translations("Mirror", (), (Key("thermostat", {None: "", "langevin": ""}),), (), ())
 
@@ -409,16 +410,16 @@ class MirrorEngine(ExternalEngine):
 SCRIPT = """
 import sys
 
-import rigidmd.engines
-from rigidmd.engines import registry
+import PACKAGE.engines
+from PACKAGE.engines import registry
 
-rigidmd.engines.__path__.append(sys.argv[1])
+PACKAGE.engines.__path__.append(sys.argv[1])
 registry.NAMES.append("mirror")
 
-from rigidmd.commands import cli
+from PACKAGE.commands import cli
 
 if sys.argv[2] == "wrong":
-    from rigidmd.engines.mirror.mirror import MirrorEngine
+    from PACKAGE.engines.mirror.mirror import MirrorEngine
 
     MirrorEngine.error = 0.1
 sys.exit(cli.main(sys.argv[3:]))
@@ -429,8 +430,8 @@ def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     folder = tmp_path / "engines" / "mirror"
     folder.mkdir(parents=True)
     for name, text in (("__init__", ""), ("options", OPTIONS), ("mirror", MIRROR)):
-        (folder / f"{name}.py").write_text(text)
-    (tmp_path / "script.py").write_text(SCRIPT)
+        (folder / f"{name}.py").write_text(text.replace("PACKAGE", "rigidmd"))
+    (tmp_path / "script.py").write_text(SCRIPT.replace("PACKAGE", "rigidmd"))
     scene = tmp_path / "argon.toml"
     scene.write_text(
         "[box]\nlengths_A = 16.0\n[[molecules]]\nmodel = 'argon'\ncount = 20\n[forces]\ncutoff_A = 7.0\n"

@@ -96,7 +96,8 @@ def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", it
     parser.add_argument("--engine", metavar="NAME", help=f"engine to use, {known}: engine.name (default: {default})")
     for key, option in engine_options().items():
         kind, metavar = (int, "N") if option.values is int else (str, "NAME")
-        text = option.description[0].lower() + option.description[1:]
+        values = f" ({', '.join(option.values)})" if isinstance(option.values, tuple) else ""
+        text = option.description[0].lower() + option.description[1:] + values
         parser.add_argument(f"--{key}", type=kind, metavar=metavar, help=text)
 
 
