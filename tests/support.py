@@ -308,7 +308,6 @@ HOMES = {
     "engines.cpu.engine": "BehindWallError DTYPES",
     "engines.protocol": "NotFiniteError",
     "engines.ode.engine": "OdeEngine",
-    "engines.protocol": "NotFiniteError",
     "forces.body.applied": "SteadyForce",
     "forces.potentials.coulomb": "radial reaction_field",
     "forces.potentials.truncation": "SWITCH_FUNCTIONS SwitchCorrection SwitchTerm TRUNCATIONS Unmodified truncation_terms",
