@@ -156,6 +156,7 @@ NAMED_EXTENSIONS = {
     "commands/models.py": "an example in --help",
     "engines/gromacs/files.py": "the files of an export and a command of GROMACS",
     "engines/lammps/files.py": "the files of an export, and commands of LAMMPS",
+    "engines/lammps/options.py": "the command that runs an export",
     "engines/openmm/files.py": "the files of an export, and its script",
 }
 
