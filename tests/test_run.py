@@ -756,7 +756,8 @@ def test_from_python_in_five_lines():
 def arrays_of(moment):
     """All arrays that a moment gives."""
     seen = moment.observation
-    given = [moment.site_positions, *moment.state, *seen, seen.force, seen.torque_body]
+    lazy = [getattr(seen, name, None) for name in ("force", "torque_body")]  # of molecules
+    given = [moment.site_positions, *moment.state, *seen, *lazy]
     return [part for part in given if isinstance(part, np.ndarray)]
 
 
