@@ -408,6 +408,7 @@ def test_a_run_that_nobody_closes_lets_its_folder_go(ends, tmp_path):
     program = f"""
 import gc, os, signal, sys
 import rigidmd
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a process that a shell starts in the background
 scene = rigidmd.Scene.read({str(TOP)!r}, {SHORT | {"output.trajectory": False}!r})
 simulation = rigidmd.Simulation(scene, "run", observers=[rigidmd.Every(0.001, lambda moment: moment.step == 16 and
     {ends!r} == "signal" and os.kill(os.getpid(), signal.SIGINT))])
