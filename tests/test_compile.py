@@ -529,7 +529,7 @@ def compiled_functions():
 def test_loops_without_counted_references_take_elements_by_their_index():
     """Iterating over a view of an array, uncounted, ended in a crash; over ranges and tuples it is safe."""
     uncounted = [(name, tree) for name, tree, keys in compiled_functions() if keys.get("count_references") == "False"]
-    assert {"block_forces", "set_local_of_block", "update_list"} <= {name for name, _ in uncounted}
+    assert {"block_forces", "set_local", "update_list"} <= {name for name, _ in uncounted}
     strange = []
     for name, tree in uncounted:
         for node in ast.walk(tree):

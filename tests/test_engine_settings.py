@@ -426,6 +426,7 @@ sys.exit(cli.main(sys.argv[3:]))
 """
 
 
+@pytest.mark.timeout(900)  # processes that compile
 def test_adding_an_engine_takes_a_folder_and_a_line(tmp_path):
     folder = tmp_path / "engines" / "mirror"
     folder.mkdir(parents=True)

@@ -53,8 +53,6 @@ def _accuracy(options: argparse.Namespace) -> int:
 
     scene = read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
-    check_folder(folder, options.force, names=FILES)
-    (lock := FolderLock(folder)).take()
     integrators = options.integrators.split(",") if options.integrators else None
     try:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
@@ -64,13 +62,15 @@ def _accuracy(options: argparse.Namespace) -> int:
         return _averages(options, scene, folder, integrators, timesteps)
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages without a PS"])
-    with progress_bar("compiling and running the reference") as progress:
-        found = measure_accuracy(
-            scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
-        )
-    print(*recommendations(found), "", table_text(found), sep="\n")
-    make_folder(folder, FILES, lock)
-    written = write_accuracy(folder, found, command_line())
+    check_folder(folder, options.force, names=FILES)
+    with FolderLock(folder) as lock:
+        with progress_bar("compiling and running the reference") as progress:
+            found = measure_accuracy(
+                scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
+            )
+        print(*recommendations(found), "", table_text(found), sep="\n")
+        make_folder(folder, FILES, lock)
+        written = write_accuracy(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0
 
@@ -83,12 +83,12 @@ def _averages(
     from rigidmd.studies.accuracy.averages_report import FILES, bias_conclusions, table_text, write_averages
 
     check_folder(folder, options.force, names=FILES)
-    (lock := FolderLock(folder)).take()
     sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-    with progress_bar("compiling, and running what comes before the last stage") as progress:
-        found = measure_averages(scene, methods, timesteps, sample, progress)
-    print(table_text(found), "", *bias_conclusions(found), sep="\n")
-    make_folder(folder, FILES, lock)
-    written = write_averages(folder, found, command_line())
+    with FolderLock(folder) as lock:
+        with progress_bar("compiling, and running what comes before the last stage") as progress:
+            found = measure_averages(scene, methods, timesteps, sample, progress)
+        print(table_text(found), "", *bias_conclusions(found), sep="\n")
+        make_folder(folder, FILES, lock)
+        written = write_averages(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return 0

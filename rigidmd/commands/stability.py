@@ -29,12 +29,12 @@ def _stability(options: argparse.Namespace) -> int:
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     check_folder(folder, options.force, names=FILES)
-    (lock := FolderLock(folder)).take()
-    with progress_bar() as progress:
-        results = list(run_cases(options.case, options.quick, progress))
-    print(table_text(results), "", *conclusions(results), sep="\n")
-    make_folder(folder, FILES, lock)
-    machine = platform.processor() or platform.machine()
-    written = write_stability(folder, results, command_line(), machine)
+    with FolderLock(folder) as lock:
+        with progress_bar() as progress:
+            results = list(run_cases(options.case, options.quick, progress))
+        print(table_text(results), "", *conclusions(results), sep="\n")
+        make_folder(folder, FILES, lock)
+        machine = platform.processor() or platform.machine()
+        written = write_stability(folder, results, command_line(), machine)
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return FAILED if has_failed(results) else 0

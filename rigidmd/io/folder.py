@@ -125,6 +125,13 @@ class FolderLock:
     def release(self) -> None:
         self._lock.release()
 
+    def __enter__(self) -> "FolderLock":
+        self.take()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
 
 def never_began(folder: Path) -> bool:
     """Whether a run ended before its first checkpoint, so that nothing is lost if it is started again."""

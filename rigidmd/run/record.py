@@ -169,9 +169,10 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
         return {}
     for owner in kept.values.get("of", {}):
         part = kept.of(owner).arrays
-        if "t" in part and set(STORED_NAMES) <= set(part):
-            states = zip(*(part[name] for name in STORED_NAMES), strict=True)
-            snapshots = [Snapshot(t, State(*state)) for t, state in zip(part["t"].tolist(), states, strict=True)]
+        if "stacked/t" in part:  # of `run.body_observers.Sampler`
+            states = zip(*(part[f"stacked/{name}"] for name in STORED_NAMES), strict=True)
+            times = part["stacked/t"].tolist()
+            snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]
             missing.append(f"{MOTION} is written at the end; the motion shown ends at the last checkpoint.")
             return motion(system, snapshots).columns
     return {}
