@@ -544,9 +544,9 @@ def test_a_table_that_is_no_use_is_told(text, tmp_path):
 
 def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
     (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
-    with pytest.raises(SceneError) as told:
+    with pytest.raises(SceneError) as refused:
         build(tabulated(tmp_path, sites=("AR",)))
-    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in told.value.errors] == [*"123456789"]
+    assert [re.search(r"argon.csv: line (\d)", fault)[1] for fault in refused.value.errors] == [*"123456789"]
     with pytest.raises(SceneError, match=r"forces.custom.0.table: '../argon.csv' is outside the scene's folder"):
         tabulated(tmp_path, table="../argon.csv")
     with pytest.raises(SceneError, match="there is no such file"):

@@ -273,9 +273,9 @@ def test_a_film_of_a_periodic_motion_ends_where_it_began(top):
     turning = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     still = {name: np.tile(values[0], (len(values), 1)) for name, values in film.vectors.items()}
     film.quaternion, film.vectors = turning, still
-    end, told = film.loop_end()
+    end, notes = film.loop_end()
     assert end == pytest.approx(0.39, abs=1e-9)
-    assert "returns to its start at 0.39 s" in told[0]
+    assert "returns to its start at 0.39 s" in notes[0]
 
 
 @pytest.mark.parametrize("command", ["report", "view", "film"])

@@ -11,9 +11,9 @@ not the start of a parallel region and a barrier of all threads at its end.
 If the pool is busy, with another calling thread or because a block itself has blocks, the calling thread runs all its
 blocks alone. The blocks of a task, not the threads, determine the bits of a result.
 
-Measured on two cores against the threading layers of Numba (`prange` over the blocks): an empty task of 16 blocks takes
-0.6 µs, with OpenMP 1.9 µs and with the work queue 80 µs. With OpenMP 500 argon atoms make 14 % fewer steps per second
-and 512 waters 22 %; with the work queue 8 and 4 times fewer, and two calling threads at once end the process.
+Measured once on two shared cores against the threading layers of Numba (`prange` over the blocks): an empty task of 16
+blocks takes 0.6 µs, with OpenMP 1.9 µs and with the work queue 70 µs. With OpenMP 500 argon atoms make 14 % fewer steps
+per second and 512 waters 22 %; with the work queue 8 and 4 times fewer.
 
 Atomic operations and the calls of Python's locks are LLVM IR that llvmlite builds; nothing of Numba is private.
 """

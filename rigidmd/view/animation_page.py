@@ -39,7 +39,7 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
 def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation) -> list[str]:
     """The animation next to the plots, its data and its scripts, as HTML."""
     part = animation.page_part()
-    left = f'<div><div class="stage">{part.picture}{BAR}<div class="readout" id="film-told"></div></div>'
+    left = f'<div><div class="stage">{part.picture}{BAR}<div class="readout" id="film-readout"></div></div>'
     left += f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
     left += f'<div class="faint">{items(part.notes)}</div></div>'
     data = json.dumps(part.data, ensure_ascii=False, separators=(",", ":"), allow_nan=False, default=_packed)

@@ -5,7 +5,7 @@
   const times = rigidmdArray(data.time, Float64Array), q = f32(data.quaternion), place = f32(data.position);
   const path = f32(data.path), when = rigidmdArray(data.when, Float64Array), angles = data.angles && f32(data.angles);
   const vectors = Object.entries(data.vectors).map(([name, text]) => ({ name, values: f32(text) }));
-  const canvas = document.getElementById("film"), pen = canvas.getContext("2d"), told = document.getElementById("film-told");
+  const canvas = document.getElementById("film"), pen = canvas.getContext("2d"), readout = document.getElementById("film-readout");
   let azimuth = data.azimuth, lift = 0.35, zoom = 1, shown = times[0];
   const color = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
   const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
@@ -168,7 +168,7 @@
     pen.fillText(`${+length.toPrecision(1)} m`, width - 16, height - 20); pen.textAlign = "left";
     if (angles) {
       const [phi, theta, psi] = [0, 1, 2].map((k) => angles[3 * moment[0] + k]);
-      told.textContent = `φ ${phi.toFixed(1)}°   θ ${theta.toFixed(2)}°   ψ ${psi.toFixed(1)}°`;
+      readout.textContent = `φ ${phi.toFixed(1)}°   θ ${theta.toFixed(2)}°   ψ ${psi.toFixed(1)}°`;
     }
   }
   const redraw = () => show(shown), fingers = new Map();

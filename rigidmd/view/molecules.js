@@ -3,7 +3,7 @@
 (async () => {
   const data = rigidmdData("film-data"), times = [...rigidmdArray(data.time, Float64Array)];
   const packed = rigidmdArray(data.positions, Int16Array), cells = data.cells && rigidmdArray(data.cells, Float32Array);
-  const size = data.elements.length, names = data.elements, told = document.getElementById("film-told");
+  const size = data.elements.length, names = data.elements, readout = document.getElementById("film-readout");
   const column = (k, axis) => Array.from({ length: size }, (_, i) => data.low + data.scale * (packed[3 * (k * size + i) + axis] + data.steps));
   const structure = (k) => {
     const found = { size, names, x: column(k, 0), y: column(k, 1), z: column(k, 2), bonds: data.bonds };
@@ -27,7 +27,7 @@
   const coarse = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(renderer);
   if (coarse) Object.defineProperty(window, "devicePixelRatio", { get: () => 0.5 });
   const warnings = new Chemiscope.Warnings();
-  warnings.addHandler((message) => { told.textContent = message; });
+  warnings.addHandler((message) => { readout.textContent = message; });
   const viewer = await Chemiscope.StructureVisualizer.load(config, dataset, warnings);
   const cell = document.querySelector("#film-picture > div").shadowRoot; // one picture needs no pin, copy and close
   for (const one of cell.querySelectorAll("*")) { // the picture, whose size is in pixels, fills its frame on paper
@@ -55,4 +55,4 @@
   });
   window.rigidmd.viewer = viewer;
   window.rigidmd.ready = performance.now();
-})().catch((error) => { document.getElementById("film-told").textContent = `The film cannot be shown: ${error.message}`; });
+})().catch((error) => { document.getElementById("film-readout").textContent = `The film cannot be shown: ${error.message}`; });
