@@ -122,8 +122,8 @@ def test_the_list_is_that_of_all(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(["analyse", "--list"])
     assert ended.value.code == 0
-    told = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert told == BUILT_IN
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert listed == BUILT_IN
 
 
 def test_results_in_memory_and_from_the_folder_agree(water):

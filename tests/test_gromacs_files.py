@@ -151,12 +151,12 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     ]
     counts = {"spce": 4, "methanol_trappe": 2, "methane_opls": 2}
     system = build(small_scene(counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}))
-    told = " ".join(table.refusals(force_field_of(system)))
+    messages = " ".join(table.refusals(force_field_of(system)))
     for words in (
         "smooth_switch", "with reaction_field", "no rigid bodies whose mass", "one kind of triangle", "andersen",
         "monte_carlo", "yoshida_4",
     ):  # fmt: skip
-        assert words in told
+        assert words in messages
     free = small_scene({"spce": 2}, None)
     with pytest.raises(SceneError, match=r"GROMACS: .*no box or no cutoff"):
         export(free, "gromacs", tmp_path / "there")

@@ -383,9 +383,9 @@ def test_what_openmm_cannot_do_is_told_at_once():
         {"duration_ps": 0.1, "integrator": "yoshida_4"},
     ]
     scene = small_scene({"spce": 4}, 13.0, stages=stages, **BOX)
-    told = " ".join(table.refusals(force_field_of(build(scene))))
+    messages = " ".join(table.refusals(force_field_of(build(scene))))
     for words in ("velocity_rescaling", "cell_rescaling", "nph", "changes over the stage", "yoshida_4"):
-        assert words in told
+        assert words in messages
     falling = small_scene(
         {"spce": 4}, 13.0, fields={"electric_V_per_nm": [0.0, 0.0, 0.1]}, engine={"name": "openmm"}, **BOX
     )
