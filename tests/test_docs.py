@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import pytest
 from pydantic import BaseModel
-from support import CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters, read_scene
+from support import BY_EXTENSION, CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters, read_scene
 
 import rigidmd
 from rigidmd.commands import cli
@@ -189,8 +189,17 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     return options
 
 
+@pytest.fixture
+def own_formats():
+    """Formats that a document registers are gone after its test."""
+    before = dict(BY_EXTENSION)
+    yield
+    BY_EXTENSION.clear()
+    BY_EXTENSION.update(before)
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
-def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsys):
+def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsys, own_formats):
     shutil.copytree(ROOT / "systems", tmp_path / "systems")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["rigidmd"])
