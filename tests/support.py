@@ -401,7 +401,7 @@ HOMES = {
     "studies.compare": "compare describe_run_comparison",
     "studies.export": "export",
     "studies.accuracy.accuracy": "measure_accuracy",
-    "studies.stability.stability": "run_cases selected_cases",
+    "studies.stability.report": "run_cases selected_cases",
     "studies.stability.cases": "CASES StabilityCase",
     "studies.sweep.backends": "Cluster Pool",
     "studies.sweep.table": "SweepRow summarise_run",

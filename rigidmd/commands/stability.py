@@ -24,8 +24,7 @@ def _stability(options: argparse.Namespace) -> int:
     import platform
 
     from rigidmd.io.folder import FolderLock, check_folder, make_folder
-    from rigidmd.studies.stability.report import FILES, conclusions, has_failed, table_text, write_stability
-    from rigidmd.studies.stability.stability import run_cases
+    from rigidmd.studies.stability.report import FILES, conclusions, has_failed, run_cases, table_text, write_stability
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     check_folder(folder, options.force, names=FILES)

@@ -2,8 +2,9 @@
 
 import time as clock
 from collections.abc import Callable
+from functools import wraps
 from math import inf, nan
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from rigidmd.run import Simulation
 from rigidmd.run.results import Results
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.stability.outcomes import CaseResult, Outcome
+
+P = ParamSpec("P")
 
 #: Integrator families: velocity Verlet with both rotors, a symplectic Nystrom scheme, compositions with split rotors.
 FAMILIES = {
@@ -65,39 +68,41 @@ def families(quick: bool) -> tuple[str, ...]:
     return QUICK if quick else tuple(FAMILIES)
 
 
-def attempt(run: Callable[[], Outcome]) -> Outcome:
-    """The outcome of a run. An error of rigidmd becomes its message, any other exception a crash."""
-    began = clock.perf_counter()
-    try:
-        with np.errstate(all="ignore"):
-            outcome = run()
-    except RigidMDError as error:
-        outcome = Outcome(message=str(error))
-    except Exception as error:  # any other error is a failure of the engine
-        outcome = Outcome(crash=f"{type(error).__name__}: {error}")
-    return outcome._replace(seconds=clock.perf_counter() - began)
+def attempt(run: Callable[P, Outcome]) -> Callable[P, Outcome]:
+    """A run whose errors are outcomes: one of rigidmd becomes a message, any other exception a crash."""
+
+    @wraps(run)
+    def attempted(*arguments: P.args, **options: P.kwargs) -> Outcome:
+        began = clock.perf_counter()
+        try:
+            with np.errstate(all="ignore"):
+                outcome = run(*arguments, **options)
+        except RigidMDError as error:
+            outcome = Outcome(message=str(error))
+        except Exception as error:  # any other error is a failure of the engine
+            outcome = Outcome(crash=f"{type(error).__name__}: {error}")
+        return outcome._replace(seconds=clock.perf_counter() - began)
+
+    return attempted
 
 
 def body_scene(data: dict, step: float, duration: float, family: str, samples: int = 50) -> dict:
     """The tables of a body's scene with a run of this family; no files."""
     known = FAMILIES | TEXTBOOK | {POINT: {"integrator": "velocity_verlet"}}
     run = {"duration_s": float(duration), "timestep_s": float(step)} | known[family]
-    output = {"trajectory": False, "figures": False, "interval_s": max(float(step), float(duration) / samples)}
-    return data | {"run": run, "output": output | {"interval_s": min(output["interval_s"], float(duration))}}
+    interval = min(max(float(step), duration / samples), float(duration))
+    return data | {"run": run, "output": {"trajectory": False, "figures": False, "interval_s": interval}}
 
 
+@attempt
 def run_body(
     data: dict, step: float, duration: float, family: str, error: Callable[[Results], float], samples: int = 50
 ) -> Outcome:
     """The outcome of a run of a body for a duration (s); error(results) compares with the known answer."""
-
-    def run() -> Outcome:
-        results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
-        wrong = list(results.summary["largest_relative_error"].values())
-        reported_error = max([*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0)
-        return Outcome(float(error(results)), float(reported_error))
-
-    return attempt(run)
+    results = Simulation(Scene.from_dict(body_scene(data, step, duration, family, samples))).run()
+    wrong = list(results.summary["largest_relative_error"].values())
+    reported_error = max([*wrong, results.summary["largest_orthogonality_error"] or 0.0], default=0.0)
+    return Outcome(float(error(results)), float(reported_error))
 
 
 def molecules_scene(
@@ -114,15 +119,8 @@ def molecules_scene(
     return scene | {"output": output}
 
 
-def molecular_scene(data: dict) -> MolecularScene:
-    scene = Scene.from_dict(data)
-    if not isinstance(scene, MolecularScene):
-        raise TypeError(f"{scene.name} is a single body")
-    return scene
-
-
 def simulate(data: dict, state: State | None = None) -> Results:
-    simulation = Simulation(molecular_scene(data))
+    simulation = Simulation(MolecularScene.from_dict(data))
     if state is not None:
         simulation.start_from(state)
     return simulation.run()
@@ -135,24 +133,18 @@ def energy_error(results: Results, scale: float = 0.0) -> float:
     return float(wrong.max() / size) if np.isfinite(wrong).all() and size > 0 else inf
 
 
+@attempt
 def run_molecules(
     data: dict, state: State | None = None, error: Callable[[Results], float] | None = None, scale: float = 0.0
 ) -> Outcome:
     """The outcome of a run of molecules; its error is the energy error unless error(results) computes another."""
-
-    def run() -> Outcome:
-        results = simulate(data, state)
-        reported_error = energy_error(results, scale)
-        return Outcome(reported_error if error is None else float(error(results)), reported_error)
-
-    return attempt(run)
+    results = simulate(data, state)
+    reported_error = energy_error(results, scale)
+    return Outcome(reported_error if error is None else float(error(results)), reported_error)
 
 
+@attempt
 def run_invalid(data: dict) -> Outcome:
     """The outcome of a scene that must be refused before it runs; one that runs has no right answer."""
-
-    def run() -> Outcome:
-        Simulation(Scene.from_dict(data)).run()
-        return Outcome(nan, 0.0)
-
-    return attempt(run)
+    Simulation(Scene.from_dict(data)).run()
+    return Outcome(nan, 0.0)

@@ -1,11 +1,11 @@
 """Stability cases: molecules that collide, overlap or lack repulsion; extreme boxes and densities; invalid input."""
 
-import copy
 import resource
 import tempfile
 from collections.abc import Iterator
 from math import inf, nan, sqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from rigidmd.assemble.describe import describe
 from rigidmd.core.state import State
 from rigidmd.core.state_file import write_state
 from rigidmd.run import Simulation
-from rigidmd.scene import Scene
+from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.stability.cases import (
     EXACT,
     SPLIT,
@@ -22,7 +22,6 @@ from rigidmd.studies.stability.cases import (
     body_scene,
     energy_error,
     families,
-    molecular_scene,
     molecules_scene,
     register,
     run_invalid,
@@ -56,7 +55,7 @@ def pair_of(distance: float, speed: float, thickness: float = 0.5) -> tuple[list
     """Two bent molecules at a distance (Å) that approach each other at a speed (Å/ps)."""
     species = [bent(thickness) | {"count": 2}]
     data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
-    state = build(molecular_scene(data)).state
+    state = build(MolecularScene.from_dict(data)).state
     state.position[:] = [[10 - distance / 2, 10, 10], [10 + distance / 2, 10.1, 10]]
     state.velocity[:] = [[speed / 2, 0, 0], [-speed / 2, 0, 0]]
     state.angular_momentum_body[:] = 0.0
@@ -88,13 +87,9 @@ def overlaps(result: CaseResult, quick: bool) -> None:
     """Two molecules released at 0.5 sigma, 0.1 sigma and 0: refused, separated or computed correctly."""
     for ratio in (0.5, 0.1, 0.0):
         data = molecules_scene([bent() | {"count": 2}], BOX, 0.01, 400, SPLIT, 10.0, None, FORCES)
-        species, state = pair_of(ratio * SIGMA, 0.0)
+        _, state = pair_of(ratio * SIGMA, 0.0)
         state.position[:, 1] = 10.0
-
-        def released(data=data, state=state) -> Outcome:
-            return from_file(data, state)
-
-        result.add(f"file with {ratio:g} sigma", released(), 0.0, SPLIT, ratio, 0.01, (REFUSED,))
+        result.add(f"file with {ratio:g} sigma", from_file(data, state), 0.0, SPLIT, ratio, 0.01, (REFUSED,))
     for density in (5.0, 50.0):
         edge = (4 * 36.0 / (density * 0.602214)) ** (1 / 3)
         cutoff = {"cutoff_A": 0.45 * edge}
@@ -102,39 +97,30 @@ def overlaps(result: CaseResult, quick: bool) -> None:
         data = molecules_scene(species, box, 0.5, 100, SPLIT, 300.0, None, cutoff)
         result.add(f"lattice of {density:g} g/cm³", run_molecules(data), 0.01, SPLIT, 0.0, 0.5, (REFUSED,))
     species, state = pair_of(0.5 * SIGMA, 0.0)
-    data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
     for family in families(quick):
 
+        @attempt
         def at(step: float, family=family) -> Outcome:
             scene = molecules_scene(species, BOX, step, max(1, round(50 / step)), family, 0.0, None, FORCES)
-            unwatched = scene | {"watch": {"kick": False}}  # this case tests the first kick
-
-            def run() -> Outcome:
-                results = simulate(unwatched, state)
-                reported_error = energy_error(results, results["potential"][0])
-                return Outcome(reported_error, reported_error)
-
-            return attempt(run)
+            results = simulate(scene | {"watch": {"kick": False}}, state)  # this case tests the first kick
+            reported_error = energy_error(results, results["potential"][0])
+            return Outcome(reported_error, reported_error)
 
         result.add("let go at 0.5 sigma", at(0.005), 1e-2, family, 0.5, 0.005)
         result.limits.append(longest_step(at, 0.005, "let go at 0.5 sigma", family))
 
 
+@attempt
 def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
     """The outcome of a scene that starts from a file with the molecules of a state."""
-
-    def run() -> Outcome:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "start.npz"
-            template = data | {"start": {"temperature_K": 0.0}}
-            system = build(molecular_scene(template))
-            write_state(path, system.saved(state))
-            started = data | {"structure": {"file": path.name, "velocities": velocities}}
-            results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
-        reported_error = energy_error(results)
-        return Outcome(reported_error, reported_error)
-
-    return attempt(run)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "start.npz"
+        template = data | {"start": {"temperature_K": 0.0}}
+        write_state(path, build(MolecularScene.from_dict(template)).saved(state))
+        started = data | {"structure": {"file": path.name, "velocities": velocities}}
+        results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
+    reported_error = energy_error(results)
+    return Outcome(reported_error, reported_error)
 
 
 @register(8, x="distance (Å)", error="energy error over kinetic energy", step="fs")
@@ -151,9 +137,9 @@ def bare_charges(result: CaseResult, quick: bool) -> None:
         data = molecules_scene([bare], BOX, 1.0, 500, family, 300.0, None, FORCES, samples=100)
         result.add("arms longer than sigma/2", run_molecules(data), 0.1, family, 0.0, 1.0, (REFUSED, REPORTED))
     data = molecules_scene([bare | {"count": 2}], BOX, 1.0, 100, SPLIT, 300.0, None, FORCES)
-    state = build(molecular_scene(data)).state
+    system = build(MolecularScene.from_dict(data))
+    state, offsets = system.state, system.sites.offset_body
     state.rotation[:] = np.eye(3)
-    offsets = build(molecular_scene(data)).sites.offset_body
     state.position[:] = [[10, 10, 10], 10 + offsets[1] - offsets[5]]
     result.add("a hydrogen on a charge site", from_file(data, state), 0.0, SPLIT, 0.0, 1.0, (REFUSED,))
 
@@ -164,10 +150,9 @@ def near_linear_molecules(result: CaseResult, quick: bool) -> None:
     heights = [0.5, 1e-2, 1e-5, 0.0] if quick else [0.5] + [10.0**-k for k in range(1, 16)] + [0.0]
     for height in heights:
         for family in families(quick):
-            step, steps = 1.0, 200
             # the smaller the moment about the axis, the faster the spin that rotates the middle site
-            data = molecules_scene([bent(height) | {"count": 27}], BOX, step, steps, family, 300.0, None, FORCES)
-            result.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), step, RIGHT_OR_REFUSED)
+            data = molecules_scene([bent(height) | {"count": 27}], BOX, 1.0, 200, family, 300.0, None, FORCES)
+            result.add(f"{height:.0e} Å", run_molecules(data), 0.02, family, max(height, 1e-16), 1.0, RIGHT_OR_REFUSED)
 
 
 @register(2, x="mass ratio", error="energy error over kinetic energy", step="fs")
@@ -197,10 +182,8 @@ def tight_boxes(result: CaseResult, quick: bool) -> None:
         result.add(f"cube, {size} twice the cutoff", run_molecules(scene(float(edge), waters)), 0.05, SPLIT)
     smaller = scene(float(np.nextafter(2 * cutoff, 0)), waters)
     result.add("cube, barely smaller", run_invalid(smaller), 0.0, SPLIT, expected=(REFUSED,))
-    slab = scene([2 * cutoff, 2 * cutoff, 60.0], waters)
-    result.add("column 12 x 12 x 60 Å", run_molecules(slab), 0.05, SPLIT)
-    slab = scene([2 * cutoff, 48.0, 48.0], waters)
-    result.add("slab 12 x 48 x 48 Å", run_molecules(slab), 0.05, SPLIT)
+    for setting, edges in (("column 12 x 12 x 60", [12.0, 12.0, 60.0]), ("slab 12 x 48 x 48", [12.0, 48.0, 48.0])):
+        result.add(f"{setting} Å", run_molecules(scene(edges, waters)), 0.05, SPLIT)
     for count in (1, 2):
         result.add(f"{count} of water", run_molecules(scene(12.0, [{"model": "spce", "count": count}])), 0.05, SPLIT)
     rod = bent(0.5)
@@ -216,13 +199,14 @@ def far_away(result: CaseResult, quick: bool) -> None:
     edge = 16.0  # a power of two, so that shifts by whole boxes are exact while digits last
     waters = [{"model": "spce", "count": 40}]
     data = molecules_scene(waters, {"lengths_A": edge}, 0.5, 10, SPLIT, 298.0, None, WATER_FORCES)
-    system = build(molecular_scene(data))
+    system = build(MolecularScene.from_dict(data))
     state = system.state.copy()
     state.position[:] = np.round(state.position * 2**10) / 2**10
     load, tallies = system.engine().evaluate(state)
     energy = sum(tally.energy for tally in tallies.values())
     force = np.abs(load.force).max()
 
+    @attempt
     def moved(position) -> Outcome:
         other = state.copy()
         other.position[:] = position
@@ -230,20 +214,20 @@ def far_away(result: CaseResult, quick: bool) -> None:
         gap = abs(sum(tally.energy for tally in there.values()) - energy) / abs(energy)
         return Outcome(max(gap, np.abs(load_there.force - load.force).max() / force), 0.0)
 
-    on_face = state.position - state.position[0]
-    result.add("one exactly on a face", attempt(lambda: moved(on_face)), 1e-10, x=1.0)
+    result.add("one exactly on a face", moved(state.position - state.position[0]), 1e-10, x=1.0)
     for shift in (1e3, 1e7, 1e12, 1e300) if quick else [10.0**k for k in (3, 5, 7, 9, 11, 13, 15, 18, 20, 100, 300)]:
         boxes = np.round(shift / edge) * edge
         away = np.where(np.arange(len(state.position))[:, None] % 2, boxes, 0.0)
         # positions have an error of eps times the distance; forces vary relatively by about ten per Å
         left = 1e3 * np.finfo(float).eps * shift
         expected = (RIGHT,) if left < 1e-3 else RIGHT_OR_REFUSED
-        outcome = attempt(lambda away=away: moved(state.position + away))
+        outcome = moved(state.position + away)
         result.add(f"evaluated {shift:.0e} Å away", outcome, max(1e-10, left), x=shift, expected=expected)
         there = state.copy()
         there.position[:] += away
-        outcome = from_file(data, there)
-        result.add(f"from a file, {shift:.0e} Å away", outcome, 0.05, SPLIT, shift, 0.5, RIGHT_OR_REFUSED)
+        result.add(
+            f"from a file, {shift:.0e} Å away", from_file(data, there), 0.05, SPLIT, shift, 0.5, RIGHT_OR_REFUSED
+        )
 
 
 @register(11, x="density (g/cm³)", error="energy error over kinetic energy", step="fs")
@@ -255,9 +239,10 @@ def densities(result: CaseResult, quick: bool) -> None:
         data = molecules_scene(waters, box, 0.25, 200, SPLIT, 298.0, None, cutoff)
         result.add(f"{density:g} g/cm³", run_molecules(data), 0.05, SPLIT, density, 0.25, RIGHT_OR_REFUSED)
     if not quick:
-        result.add("a million points", attempt(a_million_points), 0.2, SPLIT, 1.0)
+        result.add("a million points", a_million_points(), 0.2, SPLIT, 1.0)
 
 
+@attempt
 def a_million_points() -> Outcome:
     """The relative error of the memory that `rigidmd check` predicts for a million argon atoms."""
     data = molecules_scene([{"model": "argon", "count": 1_000_000}], {"density_g_cm3": 1.4}, 1.0, 1, SPLIT, 90.0)
@@ -282,21 +267,20 @@ def strange_molecules(result: CaseResult, quick: bool) -> None:
         change(kind["sites"])
         return molecules_scene([kind], BOX, 1.0, 50, SPLIT, 300.0, None, FORCES)
 
-    def set_position(sites, k, position):
-        sites[k]["position_A"] = position
+    def place(k, position):
+        return lambda sites: sites[k].update(position_A=position)
 
-    def set_masses(sites, *values):
-        for site, value in zip(sites, values, strict=True):
-            site["mass_u"] = value
+    def weigh(*masses):
+        return lambda sites: [site.update(mass_u=mass) for site, mass in zip(sites, masses, strict=True)]
 
     changes = {
-        "two coinciding sites": lambda s: set_position(s, 1, [-1.0, 0.0, 0.0]),
-        "two sites at 1e-9 Å": lambda s: set_position(s, 1, [-1.0, 1e-9, 0.0]),
-        "all sites coinciding": lambda s: [set_position(s, k, [0.0, 0.0, 0.0]) for k in range(3)],
-        "no mass": lambda s: set_masses(s, 0.0, 0.0, 0.0),
-        "negative mass": lambda s: set_masses(s, 12.0, -1.0, 12.0),
-        "all mass in one site": lambda s: set_masses(s, 0.0, 12.0, 0.0),
-        "massless site off a line of masses": lambda s: set_masses(s, 12.0, 0.0, 12.0),
+        "two coinciding sites": place(1, [-1.0, 0.0, 0.0]),
+        "two sites at 1e-9 Å": place(1, [-1.0, 1e-9, 0.0]),
+        "all sites coinciding": lambda sites: [site.update(position_A=[0.0, 0.0, 0.0]) for site in sites],
+        "no mass": weigh(0.0, 0.0, 0.0),
+        "negative mass": weigh(12.0, -1.0, 12.0),
+        "all mass in one site": weigh(0.0, 12.0, 0.0),
+        "massless site off a line of masses": weigh(12.0, 0.0, 12.0),
     }
     for setting, change in changes.items():
         result.add(setting, run_invalid(scene(change)), 0.0, SPLIT, expected=(REFUSED,))
@@ -308,22 +292,16 @@ def strange_molecules(result: CaseResult, quick: bool) -> None:
     result.add("a straight molecule given in space", run_molecules(scene(slanted)), 0.05, SPLIT)
 
 
-def numbers(data, keys: tuple = ()) -> Iterator[tuple]:
-    """The path of every number in nested tables and lists."""
+def spoiled(data: Any) -> Iterator[tuple[list, float, Any]]:
+    """Nested tables and lists with one number replaced by NaN or an infinity: its path, the value, the tables."""
     if isinstance(data, dict | list):
-        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
-            yield from numbers(value, (*keys, key))
+        for key, inner in data.items() if isinstance(data, dict) else enumerate(data):
+            for keys, value, changed in spoiled(inner):
+                copied = data.copy()
+                copied[key] = changed
+                yield [key, *keys], value, copied
     elif isinstance(data, int | float) and not isinstance(data, bool):
-        yield keys
-
-
-def replaced(data: dict, keys: tuple, value) -> dict:
-    other = copy.deepcopy(data)
-    inner = other
-    for key in keys[:-1]:
-        inner = inner[key]
-    inner[keys[-1]] = value
-    return other
+        yield from (([], value, value) for value in (nan, inf, -inf))
 
 
 @register(13)
@@ -340,18 +318,14 @@ def no_numbers(result: CaseResult, quick: bool) -> None:
     }
     body = body_scene(tables, 0.01, 1.0, EXACT)
     for setting, data in (("molecules", molecules), ("body", body)):
-        for keys in numbers(data):
-            for value in (nan, inf, -inf):
-                outcome = run_invalid(replaced(data, keys, value))
-                result.add(
-                    f"{setting}, {'.'.join(map(str, keys))} = {value}", outcome, 0.0, setting, expected=(REFUSED,)
-                )
+        for keys, value, bad in spoiled(data):
+            name = f"{setting}, {'.'.join(map(str, keys))} = {value}"
+            result.add(name, run_invalid(bad), 0.0, setting, expected=(REFUSED,))
     species, state = pair_of(5.0, 0.1)
     file = molecules_scene(species, BOX, 1.0, 10, SPLIT, None, None, FORCES)
     for part in ("position", "velocity", "rotation", "angular_momentum_body"):
         for value in (nan, inf):
             bad = state.copy()
             getattr(bad, part)[1] = value
-            result.add(
-                f"structure, {part} = {value}", from_file(file, bad, True), 0.0, "structure", expected=(REFUSED,)
-            )
+            outcome = from_file(file, bad, True)
+            result.add(f"structure, {part} = {value}", outcome, 0.0, "structure", expected=(REFUSED,))

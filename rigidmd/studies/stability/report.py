@@ -1,30 +1,59 @@
-"""Report of `rigidmd stability`: a table, conclusions, stability.csv, .md and a self-contained page."""
+"""`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv, .md and a page."""
 
 import html
+import time as clock
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
 from math import inf, isfinite, isnan
 from pathlib import Path
 
 import numpy as np
 
 from rigidmd.core.files import write_text
+from rigidmd.errors import SceneError
 from rigidmd.figures.style import INK, curve_style, label_minor_ticks, new_figure, open_axis
 from rigidmd.io.table import format_cell
 from rigidmd.io.write import columns_text, write_csv
+from rigidmd.scene.validation import did_you_mean
+from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
+from rigidmd.studies.stability.cases import CASES, StabilityCase
 from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide, write_page
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
+#: How a verdict is shown.
+KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))
+#: Messages of a case at most.
+MESSAGES = 3
+#: Errors of exactly 0 are drawn here.
+FLOOR = 1e-17
 
 
-def rows(results: Iterable[CaseResult]) -> list[list[str]]:
-    """A row for each case and integrator."""
-    return [_row(result, family) for result in results for family in result.families]
+def selected_cases(names: list[str] | None) -> list[StabilityCase]:
+    """The cases of these names, or all. Raises SceneError with a suggestion."""
+    if unknown := [name for name in names or [] if name not in CASES]:
+        known = f"(known: {', '.join(CASES)})"
+        raise SceneError("--case", [f"unknown case {name!r}{did_you_mean(name, CASES)} {known}" for name in unknown])
+    return sorted((CASES[name] for name in names or CASES), key=lambda case: case.group)
 
 
-def _row(result: CaseResult, family: str) -> list[str]:
+def run_cases(
+    names: list[str] | None = None, quick: bool = False, progress: Callable[..., object] = lambda *_: None
+) -> Iterator[CaseResult]:
+    """Yield the results of the named cases (default: all) in order. progress(fraction done, name) : before each"""
+    cases = selected_cases(names)
+    for k, case in enumerate(cases):
+        progress(k / len(cases), case.name)
+        result = CaseResult(case.name, case.group, case.sentence, *case.titles)
+        began = clock.perf_counter()
+        case.run(result, quick)
+        result.seconds = clock.perf_counter() - began
+        yield result
+
+
+def row_of(result: CaseResult, family: str) -> list[str]:
+    """The row of a case and an integrator in the table of all."""
     runs = [t for t in result.runs if t.family == family]
     limits = [limit for limit in result.limits if limit.family == family]
     verdicts = Counter(t.verdict for t in runs)
@@ -46,7 +75,11 @@ def _row(result: CaseResult, family: str) -> list[str]:
 
 
 def table_text(results: list[CaseResult]) -> str:
-    return columns_text([HEADERS, *rows(results)], left=(0, 1, 3, 7))
+    return columns_text([HEADERS, *rows_of(results)], left=(0, 1, 3, 7))
+
+
+def rows_of(results: list[CaseResult]) -> list[list[str]]:
+    return [row_of(result, family) for result in results for family in result.families]
 
 
 def conclusions(results: list[CaseResult]) -> list[str]:
@@ -73,23 +106,24 @@ def has_failed(results: list[CaseResult]) -> bool:
 def write_stability(folder: Path, results: list[CaseResult], command: str, machine: str) -> list[Path]:
     titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
-    write_csv(folder / FILES[0], [titles, *(line for result in results for line in _csv_lines(result))])
+    lines: list[list] = []
+    for of in results:
+        begin, unit = [of.name, of.group], of.step_unit
+        lines += [
+            [*begin, "run", t.setting, t.family, t.step, unit, t.outcome.error, t.allowed, t.outcome.reported_error,
+             t.verdict, " or ".join(t.expected), "", t.outcome.seconds, t.outcome.message or t.outcome.crash]
+            for t in of.runs
+        ]  # fmt: skip
+        lines += [
+            [*begin, "longest step", limit.setting, limit.family, limit.longest, unit, *[""] * 5, limit.beyond,
+             limit.seconds, limit.message]
+            for limit in of.limits
+        ]  # fmt: skip
+    cells = [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
+    write_csv(folder / FILES[0], [titles, *cells])
     write_text(folder / FILES[2], markdown(results, command, machine))
     write_page(folder / FILES[1], lambda: stability_page(results, command, machine))
     return [folder / name for name in FILES if (folder / name).is_file()]
-
-
-def _csv_lines(result: CaseResult) -> list[list]:
-    lines = [
-        [result.name, result.group, "run", t.setting, t.family, t.step, result.step_unit, t.outcome.error,
-         t.allowed, t.outcome.reported_error, t.verdict, " or ".join(t.expected), "", t.outcome.seconds,
-         t.outcome.message or t.outcome.crash] for t in result.runs
-    ]  # fmt: skip
-    lines += [
-        [result.name, result.group, "longest step", limit.setting, limit.family, limit.longest, result.step_unit,
-         *[""] * 5, limit.beyond, limit.seconds, limit.message] for limit in result.limits
-    ]  # fmt: skip
-    return [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
 
 
 def markdown(results: list[CaseResult], command: str, machine: str) -> str:
@@ -97,7 +131,7 @@ def markdown(results: list[CaseResult], command: str, machine: str) -> str:
     lines += [f"- *{verdict}*: {meaning}" for verdict, meaning in VERDICTS.items()]
     bound = f"- *longest step*: at which conserved quantities stay within {BOUND:g} of the kinetic energy, bisected"
     lines += [bound, "", "| " + " | ".join(HEADERS) + " |", "|" + "---|" * len(HEADERS)]
-    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for line in rows(results)]
+    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for line in rows_of(results)]
     lines += ["", "## Cases", ""]
     for f in results:
         lines.append(f"- **{f.name}** ({f.group}): {f.sentence}.")
@@ -119,7 +153,9 @@ def case_figure(result: CaseResult, styles: dict[str, dict] | None = None):
     for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
         for family in result.families:
             (_draw_runs if kind == "runs" else _draw_limits)(axis, result, family, styles[family])
-        axis.set_xscale("log" if _positive(axis) else "linear")
+        at = np.concatenate([line.get_xdata() for line in axis.get_lines()])
+        low, high = at.min(initial=inf), at.max(initial=0)
+        axis.set_xscale("log" if low > 0 and high > 20 * low else "linear")
         axis.set_yscale("log")
         open_axis(axis, labelsize=7, which="both")
         for line in (axis.xaxis, axis.yaxis):
@@ -135,15 +171,6 @@ def styles_of(results: list[CaseResult]) -> dict[str, dict]:
     """Colour and marker of each integrator, the same in all figures."""
     names = dict.fromkeys(family for result in results for family in result.families)
     return {name: {key: curve_style(k)[key] for key in ("color", "marker")} for k, name in enumerate(names)}
-
-
-def _positive(axis) -> bool:
-    data = np.concatenate([line.get_xdata() for line in axis.get_lines()])
-    return data.min(initial=inf) > 0 and data.max(initial=0) > 20 * data.min(initial=inf)
-
-
-#: Errors of exactly 0 are drawn here.
-FLOOR = 1e-17
 
 
 def _draw_runs(axis, result: CaseResult, family: str, style: dict) -> None:
@@ -171,41 +198,29 @@ def _draw_limits(axis, result: CaseResult, family: str, style: dict) -> None:
     axis.set_ylabel("largest error of a conserved quantity")
 
 
-#: How a verdict is shown.
-KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))
-#: Messages of a case at most.
-MESSAGES = 3
-
-
 def stability_page(results: list[CaseResult], command: str, machine: str) -> str:
     styles = styles_of(results)
-    links = {f.name: _link(f) for f in results}
-    glance = [[links[f.name], *_counts(f), f.sentence] for f in results]
+    links = {f.name: Raw(f'<a href="#case-{plain(f.name)}">{plain(f.name)}</a>') for f in results}
+    glance = []
+    for f in results:
+        counts = Counter(t.verdict for t in f.runs)
+        counts.update(limit.beyond for limit in f.limits if limit.beyond in (UNDETECTED, CRASH))
+        cells = [Raw(f'<span class="{KINDS[v]}">{counts[v]}</span>' if counts[v] else "") for v in VERDICTS]
+        glance.append([links[f.name], *cells, f.sentence])
     meanings = [[Raw(_badge(verdict)), meaning] for verdict, meaning in VERDICTS.items()]
     bound = f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic energy."
     parts = [
         items(conclusions(results)),
         section("At a glance", table(["case", *VERDICTS, ""], glance), table([], meanings, words=True)),
-        section("All integrators", table(HEADERS, rows(results), marked=links), f"<p>{html.escape(bound)}</p>"),
+        section("All integrators", table(HEADERS, rows_of(results), marked=links), f"<p>{html.escape(bound)}</p>"),
         *(_case(result, styles) for result in results),
         section("How to repeat it", code(f"{command}    # on {machine}")),
     ]
     return page("Stability", parts)
 
 
-def _link(result: CaseResult) -> Raw:
-    return Raw(f'<a href="#case-{plain(result.name)}">{plain(result.name)}</a>')
-
-
 def _badge(verdict: str, count: str = "") -> str:
     return f'<span class="badge {KINDS[verdict]}">{html.escape(f"{count} {verdict}".strip())}</span>'
-
-
-def _counts(result: CaseResult) -> list[Raw]:
-    """How many runs got each verdict, step limits with an undetected error or a crash among them."""
-    counts = Counter(t.verdict for t in result.runs)
-    counts.update(limit.beyond for limit in result.limits if limit.beyond in (UNDETECTED, CRASH))
-    return [Raw(f'<span class="{KINDS[v]}">{counts[v]}</span>' if counts[v] else "") for v in VERDICTS]
 
 
 def _case(result: CaseResult, styles: dict[str, dict]) -> str:

@@ -130,6 +130,7 @@ def equipartition(result: CaseResult, quick: bool) -> None:
                 molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, samples=steps // 10
             )
 
+            @attempt
             def run(data=data) -> Outcome:
                 results = simulate(data)
                 half = len(results["time"]) // 5
@@ -140,7 +141,7 @@ def equipartition(result: CaseResult, quick: bool) -> None:
                 gap = abs(rotation - translation) / hypot(its_error, error)
                 return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
 
-            result.add(f"{setting}, {step:g} fs", attempt(run), 4.0, SPLIT, step, step)
+            result.add(f"{setting}, {step:g} fs", run(), 4.0, SPLIT, step, step)
 
 
 @register(6, x="dt / time constant", error="kinetic energy, standard errors from the canonical mean")
