@@ -68,7 +68,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F10", "viscosity: rectangles at the ends of steps, not trapezoids",
-        "analysis/built_in/shear_viscosity.py",
+        "analysis/built_in/transport.py",
         "(np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))",
         "(np.cumsum(seen, axis=1) - seen[:, :1])",
         ("test_analyse.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",),

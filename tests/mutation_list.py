@@ -70,14 +70,14 @@ CORE = [
     ),
     Mutation(
         "A8", "mean squared displacement: one origin too few",
-        "analysis/correlation.py",
+        "analysis/built_in/transport.py",
         "/ (frames - lag) / n",
         "/ (frames - lag - 1) / n",
         ("test_analyse.py::test_correlations_are_those_of_the_definition",),
     ),
     Mutation(
         "A9", "viscosity: the differences of normal stresses are not halved",
-        "analysis/built_in/shear_viscosity.py",
+        "analysis/built_in/transport.py",
         "(xx - yy) / 2, (yy - zz) / 2], axis=1)",
         "(xx - yy), (yy - zz)], axis=1)",
         ("test_analyse.py::test_the_viscosity_is_the_integral_of_the_stress_and_its_error_honest",),

@@ -13,28 +13,28 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
-from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.source import frames_of_folder
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import COLORS, FAINT, INK, label_minor_ticks, open_axis, thin_series, write_figure
+from rigidmd.figures.style import (
+    COLORS,
+    FAINT,
+    INK,
+    label_minor_ticks,
+    new_figure,
+    open_axis,
+    thin_series,
+    write_figure,
+)
 from rigidmd.io.folder import add_to_folder, written_by_runs
 from rigidmd.io.run_files import Bounded, read_columns, read_json
 from rigidmd.io.write import nine_digits, write_csv, write_json
 from rigidmd.run.record import read_record
 
 ANALYSIS = "analysis.json"
-#: What analysis.json has of a curve.
-CURVE_KEYS = ("file", "label", "log", "level", "bars")
 #: Size of a figure, inches, and most curves in it.
 WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
 #: Headers of columns that are in the file and not drawn.
 UNDRAWN = re.compile(r"n .+-.+")
-
-
-def describe_range(frames: RigidFrames) -> dict[str, Any]:
-    """The part of analysis.json on the frames that were used."""
-    begin, end = float(frames.time[0]), float(frames.time[-1])
-    return {"stage": frames.stage.label, "from_ps": begin, "to_ps": end, "frames": len(frames), "notes": frames.notes}
 
 
 def write_results(
@@ -42,58 +42,50 @@ def write_results(
 ) -> list[Path]:
     """Write results; entries of other analyses in the folder stay. Returns the files. Raises OutputError.
 
-    frames_used : see `describe_range`; failed : analysis -> a sentence on why it has failed
+    frames_used : see `AnalysisOutput`; failed : analysis -> a sentence on why it has failed
     """
     known = read_table(folder)
     owner = {name: analysis for analysis, entry in known.items() for name in entry["files"]}
     marked = written_by_runs(folder)
-    new = {}
+    new, files = {}, {}
     for result in results:
-        for name in (f"{curve.file}{suffix}" for curve in result.curves for suffix in (".csv", ".png")):
-            if new.setdefault(name, result.name) != result.name or owner.get(name, result.name) != result.name:
-                other = new[name] if new[name] != result.name else owner[name]
-                raise OutputError(f"{folder / name} is a file of the analysis {other}; rename {result.name}")
+        names = files[result.name] = [f"{curve.file}{end}" for curve in result.curves for end in (".csv", ".png")]
+        for name in names:
+            others = {new.setdefault(name, result.name), owner.get(name, result.name)} - {result.name}
+            if others:
+                raise OutputError(f"{folder / name} is a file of the analysis {others.pop()}; rename {result.name}")
             known_there = name in owner or (is_built_in(result.name) and name in marked)
             if (folder / name).exists() and not known_there:
                 raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
     add_to_folder(folder, [ANALYSIS, *new])
-    written, pictures = [], {}
-    entries = dict(known)
+    entries, curves = dict(known), [curve for result in results for curve in result.curves]
     for result in results:
-        files = []
-        for curve in result.curves:
-            path, picture = folder / f"{curve.file}.csv", folder / f"{curve.file}.png"
-            write_csv(path, _rows(curve), csv.QUOTE_NONNUMERIC)
-            pictures[picture] = curve
-            written += [path, picture]
-            files += [path.name, picture.name]
         entries[result.name] = {
             "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
-            "curves": [{key: getattr(curve, key) for key in CURVE_KEYS} for curve in result.curves], "files": files,
-            "stretch": frames_used,
+            "curves": [{key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves],
+            "files": files[result.name], "stretch": frames_used,
         }  # fmt: skip
     for name, reason in failed.items():
         lists = {"values": [], "notes": [reason], "curves": [], "files": []}
         entries[name] = {"about": name, **lists, "stretch": frames_used}
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
+    for curve in curves:
+        columns = dict([curve.axis])
+        for header, values in curve.columns.items():
+            columns[header] = values
+            if header in curve.errors:
+                columns[f"{header} error"] = curve.errors[header]
+        lines = (list(map(nine_digits, line)) for line in zip(*columns.values(), strict=True))
+        write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], csv.QUOTE_NONNUMERIC)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
-    for picture, curve in pictures.items():
-        write_figure(picture, partial(curve_figure, curve))
-    return [folder / ANALYSIS, *(path for path in written if path.is_file())]
-
-
-def _rows(curve: Curve) -> list[list[Any]]:
-    """Rows of the file of a curve: the axis, the columns, each followed by its error if there is one."""
-    columns = {curve.axis[0]: curve.axis[1]}
-    for header, values in curve.columns.items():
-        columns[header] = values
-        if header in curve.errors:
-            columns[f"{header} error"] = curve.errors[header]
-    lines = zip(*columns.values(), strict=True)
-    return [list(columns), *(list(map(nine_digits, line)) for line in lines)]
+    for curve in curves:
+        write_figure(folder / f"{curve.file}.png", partial(curve_figure, curve))
+    return [path for name in (ANALYSIS, *new) if (path := folder / name).is_file()]
 
 
 class _Curve(BaseModel):
+    """What analysis.json has of a curve."""
+
     file: str
     label: str
     log: tuple[bool, bool]
@@ -145,31 +137,26 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises OutputError."""
     found = []
     for name, entry in read_table(folder).items():
-        curves = [_read_curve(folder, curve) for curve in entry["curves"]]
+        curves, used = [], entry["stretch"]
+        for described in entry["curves"]:
+            path = folder / f"{Path(described['file']).name}.csv"
+            read = read_columns(path)
+            if read is None or not read.cells:
+                raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
+            head, *rest = read.cells
+            table = {title: read.numbers(title) for title in read.cells}
+            columns = {t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}}
+            errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
+            curves.append(Curve(**described | {"axis": (head, table[head]), "columns": columns, "errors": errors}))
         values = [Value(**value) for value in entry["values"]]
-        used = entry["stretch"]
         phrase = f"{used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps"
         found.append((AnalysisResult(name, entry["about"], values, curves, entry["notes"]), phrase))
     return found
 
 
-def _read_curve(folder: Path, described: dict[str, Any]) -> Curve:
-    path = folder / f"{Path(described['file']).name}.csv"
-    read = read_columns(path)
-    if read is None or not read.cells:
-        raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
-    head = list(read.cells)
-    table = {title: read.numbers(title) for title in head}
-    columns = {title: table[title] for title in head[1:] if title.removesuffix(" error") not in set(head) - {title}}
-    errors = {title.removesuffix(" error"): table[title] for title in head[1:] if title not in columns}
-    return Curve(**described | {"axis": (head[0], table[head[0]]), "columns": columns, "errors": errors})
-
-
 def curve_figure(curve: Curve):
     """The figure of a curve: each column with a band of one standard error."""
-    from rigidmd.figures.picture import Picture
-
-    figure = Picture(figsize=(WIDTH, HEIGHT), layout="constrained")
+    figure = new_figure(WIDTH, HEIGHT)
     axis = figure.subplots()
     header, x = curve.axis
     shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]
@@ -213,9 +200,9 @@ class AnalysisRequest(NamedTuple):
 
 
 class AnalysisOutput(NamedTuple):
-    """failed : analysis -> why it has failed, if it was not requested by name"""
+    """failed : analysis -> why it has failed, if it was not requested by name; frames_used : for analysis.json"""
 
-    frames: RigidFrames
+    frames_used: dict[str, Any]  # stage, times (ps) from which and to which, number, notes
     results: list[AnalysisResult]
     failed: dict[str, str]
     files: list[Path]
@@ -247,6 +234,9 @@ def analyse_folder(
             failed[entry.name] = str(error)
     if not results:
         raise OutputError(f"{folder}: no analysis is possible: {'; '.join(failed.values())}")
-    files = write_results(folder, describe_range(frames), results, failed)
+    time = frames.time
+    used = {"stage": frames.stage.label, "from_ps": float(time[0]), "to_ps": float(time[-1]), "frames": len(time)}
+    used |= {"notes": frames.notes}
+    files = write_results(folder, used, results, failed)
     progress(1.0, "")
-    return AnalysisOutput(frames, results, failed, files)
+    return AnalysisOutput(used, results, failed, files)

@@ -34,9 +34,7 @@ class Analysis(NamedTuple):
 KNOWN: dict[str, Analysis] = {}
 
 
-def built_in(
-    about: str, position: float = inf
-) -> Callable[[Callable[..., AnalysisResult]], Callable[..., AnalysisResult]]:
+def built_in(about: str, position: float = inf) -> Callable[[Function], Function]:
     """Register a built-in analysis under the name of its function."""
 
     def add(function: Function) -> Function:
@@ -75,7 +73,24 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
 
     @wraps(function)
     def analysis(frames: RigidFrames) -> AnalysisResult:
-        return _analyse_by_function(name, about, function, frames)
+        """Means and errors of its values."""
+        try:
+            found = function(frames)
+        except (Exception, SystemExit) as error:  # a user's function may raise anything
+            raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
+        series = dict(found) if isinstance(found, Mapping) else {name: found}
+        if not series:
+            raise OutputError(f"the analysis {name} returned an empty dictionary")
+        columns = {str(title): _checked_series(name, title, given, len(frames)) for title, given in series.items()}
+        values = []
+        for title, array in columns.items():
+            value, error = mean_and_error(array)
+            if np.ptp(array) == 0 or value is None:
+                values.append(Value(title, "", float(array[0]), 0.0))
+            else:
+                tau = correlation_time(array, frames.span / (len(frames) - 1))
+                values.append(converged_value(title, "", value, error, frames.span, tau))
+        return AnalysisResult(name, about, values, [Curve(name, ("Time (ps)", frames.time), about, columns)])
 
     KNOWN[name] = Analysis(name, about, analysis, inf, True)
     return function
@@ -115,38 +130,18 @@ def run_user_file(path: Path) -> None:
         raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis.register before a function of frames")
 
 
-def _analyse_by_function(
-    name: str, about: str, function: Callable[[RigidFrames], Any], frames: RigidFrames
-) -> AnalysisResult:
-    """Means and errors of the values of a user-defined function."""
+def _checked_series(name: str, title: object, given: Any, count: int) -> np.ndarray:
+    """What a user-defined analysis returned, as one number for each frame (f,). Raises OutputError."""
     try:
-        found = function(frames)
-    except (Exception, SystemExit) as error:  # a user's function may raise anything
-        raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
-    series = dict(found) if isinstance(found, Mapping) else {name: found}
-    if not series:
-        raise OutputError(f"the analysis {name} returned an empty dictionary")
-    values, columns = [], {}
-    for title, given in series.items():
-        try:
-            array = np.asarray(given, float)
-        except (TypeError, ValueError):
-            array = np.array([])
-        if array.shape != (len(frames),):
-            raise OutputError(
-                f"the analysis {name} must return one number for each of the {len(frames)} frames, or a dictionary of "
-                f"such arrays; {title!r} has the shape {np.shape(given)}"
-            )
-        if not np.isfinite(array).all():
-            raise OutputError(
-                f"the analysis {name}: {title!r} is not a finite number at frame {np.isfinite(array).argmin() + 1}"
-            )
-        columns[str(title)] = array
-        value, error = mean_and_error(array)
-        gap = frames.span / (len(frames) - 1)
-        if np.ptp(array) == 0 or value is None:
-            values.append(Value(str(title), "", float(array[0]), 0.0))
-        else:
-            tau = correlation_time(array, gap)
-            values.append(converged_value(str(title), "", value, error, frames.span, tau))
-    return AnalysisResult(name, about, values, [Curve(name, ("Time (ps)", frames.time), about, columns)])
+        array = np.asarray(given, float)
+    except (TypeError, ValueError):
+        array = np.array([])
+    if array.shape != (count,):
+        raise OutputError(
+            f"the analysis {name} must return one number for each of the {count} frames, or a dictionary of such "
+            f"arrays; {title!r} has the shape {np.shape(given)}"
+        )
+    if not np.isfinite(array).all():
+        frame = np.isfinite(array).argmin() + 1
+        raise OutputError(f"the analysis {name}: {title!r} is not a finite number at frame {frame}")
+    return array

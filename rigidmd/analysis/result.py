@@ -15,9 +15,9 @@ from rigidmd.run.rigid_fit import Kind
 BLOCKS = 5
 #: Groups of molecules at most, whose scatter gives errors too.
 MAX_GROUPS = 10
-#: Least length of a run for a value, in correlation times: of the whole system, and of single molecules, of which there
-#: are many, and each block should be one correlation time long.
-MIN_CORRELATION_TIMES, MIN_MOLECULAR_TIMES = 20.0, float(BLOCKS)
+#: Least length of a run for a value in correlation times of the whole system. For those of single molecules, of which
+#: there are many, it is `BLOCKS`, because each block should be one correlation time long.
+MIN_CORRELATION_TIMES = 20.0
 
 
 class Value(NamedTuple):
@@ -104,9 +104,12 @@ class AnalysisResult:
     __repr__ = __str__
 
 
-def describe_so_far(value: float, error: float | None = None, unit: str = "") -> str:
-    """A phrase with the value from a run that is too short."""
-    return f"So far: {format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
+def too_short(
+    name: str, unit: str, value: float, error: float | None, why: str, correlation: float | None = None
+) -> Value:
+    """No value, because the run is too short: why it is, and the value so far."""
+    so_far = f"{format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
+    return Value(name, unit, None, None, correlation, f"{why}. So far: {so_far}")
 
 
 def converged_value(
@@ -117,33 +120,24 @@ def converged_value(
     if not correlation > 0 or not isfinite(value):
         return Value(name, unit, None, None, None, "the frames give no correlation time")
     if (lengths := span / correlation) < least:
-        note = (
+        why = (
             f"{span:.3g} ps are {lengths:.2g} correlation times of {correlation:.3g} ps, too short for a value; "
-            f"{least:g} of them are {least * correlation:.3g} ps. {describe_so_far(value, error, unit)}"
+            f"{least:g} of them are {least * correlation:.3g} ps"
         )
-        return Value(name, unit, None, None, correlation, note)
+        return too_short(name, unit, value, error, why, correlation)
     if error is None or not isfinite(error):
-        return Value(
-            name, unit, None, None, correlation, f"too short for an error. {describe_so_far(value, None, unit)}"
-        )
+        return too_short(name, unit, value, None, "too short for an error", correlation)
     return Value(name, unit, value, error, correlation, note)
-
-
-def split_in_blocks(frames: RigidFrames, count: int = BLOCKS) -> list[RigidFrames]:
-    """Frames in parts of equal length, of at least two frames, without the first ones if they do not divide."""
-    size = len(frames) // count
-    if size < 2:
-        return []
-    first = len(frames) - size * count
-    return [frames.part(first + k * size, first + (k + 1) * size) for k in range(count)]
 
 
 def with_block_error(
     frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An array computed from frames, and its standard error from blocks of them."""
-    whole = np.asarray(function(frames), float)
-    parts = [np.asarray(function(part), float) for part in split_in_blocks(frames)]
+    """An array computed from frames, and its standard error from blocks of them, of at least two frames, without the
+    first ones if they do not divide."""
+    whole, size = np.asarray(function(frames), float), len(frames) // BLOCKS
+    blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
+    parts = [np.asarray(function(frames[k : k + size]), float) for k in blocks]
     return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
 
 

@@ -123,19 +123,13 @@ class RigidFrames:
                 at.append((centre[:, :, None] + arms).reshape(len(centre), -1, 3))
                 molecules.append(np.repeat(kind.index, len(chosen)))
         if not at:
-            known = known_names(self.system)
+            species = self.system.species
+            known = [*dict.fromkeys([n for m in species for n in m.site_names] + [m.name for m in species])]
             raise OutputError(f"unknown site {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}")
         return np.concatenate(at, axis=1), np.concatenate(molecules)
 
-    def part(self, first: int, end: int) -> "RigidFrames":
-        """The frames from `first` to `end`, with all samples."""
-        return self._of(slice(first, end))
-
-    def thinned(self, most: int) -> "RigidFrames":
-        """At most `most` of the frames, evenly spaced."""
-        return self._of(slice(None, None, max(1, -(-len(self) // most))))
-
-    def _of(self, frames: slice) -> "RigidFrames":
+    def __getitem__(self, frames: slice) -> "RigidFrames":
+        """Some of the frames, with all samples."""
         return replace(
             self, time=self.time[frames], cell=self.cell[frames], positions=self.positions[frames], Q=self.Q[frames],
             velocities=None if self.velocities is None else self.velocities[frames],
@@ -148,12 +142,6 @@ def sites_named(molecule: Molecule, name: str) -> list[int]:
     found = [k for k, site in enumerate(molecule.site_names) if site == name]
     found = found or [k for k, site in enumerate(molecule.site_names) if site.rstrip("0123456789") == name]
     return found or [k for k, element in enumerate(molecule.elements) if element == name and name != "X"]
-
-
-def known_names(system: System) -> list[str]:
-    """The names that `RigidFrames.sites` accepts: of sites, then of species."""
-    known = dict.fromkeys(name for m in system.species for name in m.site_names)
-    return list(known | dict.fromkeys(m.name for m in system.species))
 
 
 def fit_frames(

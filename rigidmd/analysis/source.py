@@ -1,7 +1,7 @@
 """Frames for analyses, from the folder of a run or from results in memory; and where production begins."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from rigidmd.engines.samples import moving
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.log import TENSOR_FILE, read_tensor
-from rigidmd.io.trajectory import read_frames
+from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record
 from rigidmd.scene.stage import Stage
 
@@ -35,22 +35,17 @@ def frames_of_folder(
         raise OutputError(
             f"{record.folder} is a run of a single body, and analyses are for molecules; `rigidmd report` shows it"
         )
-    system = record.molecules
-    output = system.scene.output
-    path = record.trajectory
-    sites = system.site_count
-    most = max(2, MOST_NUMBERS // (3 * sites + 18 * len(system.model.species)))
-    frames = read_frames(path, sites, most)
+    system, path = record.molecules, record.trajectory
+    most = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
+    frames = read_frames(path, system.site_count, most)
     tensor = read_tensor(record.folder / TENSOR_FILE)
     notes = list(record.missing)
     if frames.stride > 1:
         notes.append(f"every {frames.stride}th frame is used: {frames.count} need too much memory")
     if frames.is_cut:
         notes.append(f"{path.name} ends within a frame, which is left out")
-    cells = np.tile(NO_CELL, (len(frames.time), 1, 1)) if frames.cells is None else frames.cells
-    stored = _StoredFrames(frames.time, frames.positions, frames.velocities, cells, output.positions == "wrapped")
     try:
-        return _rigid_frames(system, record.columns, stored, tensor, start, notes, progress)
+        return _rigid_frames(system, record.columns, frames, tensor, start, notes, progress)
     except OutputError as error:
         raise OutputError(f"{path}: {error}") from None
 
@@ -67,13 +62,11 @@ def frames_of_results(results: "Results", start: float | None = None) -> RigidFr
     frames = results._frames
     if not frames:
         raise OutputError("this run has no frames (output.trajectory = false) to analyse")
-    stored = _StoredFrames(
-        np.array([frame.time for frame in frames]),
-        np.array([frame.positions for frame in frames]),
-        np.array([frame.velocities for frame in frames]),
-        np.array([frame.cell for frame in frames]),
-        system.scene.output.positions == "wrapped",
+    count, cells = len(frames), np.array([frame.cell for frame in frames])
+    time, positions, velocities = (
+        np.array([getattr(frame, name) for frame in frames]) for name in ("time", "positions", "velocities")
     )
+    stored = Frames(time, positions, cells, count, 1, False, velocities)
     columns = {name: results[name] for name in results.units}
     return _rigid_frames(system, columns, stored, results._tensor, start, [], lambda fraction: None)
 
@@ -87,18 +80,8 @@ def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
     return stage, shown & (time >= begin) & (time <= last)
 
 
-class _StoredFrames(NamedTuple):
-    """Frames as written: times (f,), sites and velocities (f, s, 3), cells (f, 3, 3); whether centres are wrapped."""
-
-    time: np.ndarray
-    sites: np.ndarray
-    velocities: np.ndarray | None
-    cells: np.ndarray
-    wrapped: bool
-
-
 def _rigid_frames(
-    system: System, columns: dict[str, np.ndarray], stored: _StoredFrames, tensor: np.ndarray | None,
+    system: System, columns: dict[str, np.ndarray], stored: Frames, tensor: np.ndarray | None,
     start: float | None, notes: list[str], progress: Callable[[float], object],
 ) -> RigidFrames:  # fmt: skip
     stage, first, last, shown = _last_stage(system, columns)
@@ -108,8 +91,7 @@ def _rigid_frames(
         notes.append(f"production begins at {begin:g} ps, as detected in the stage from {first:g} to {last:g} ps")
     else:
         begin = start
-        if begin < first:
-            notes.append(f"frames before {first:g} ps are of an earlier stage")
+        notes += [f"frames before {first:g} ps are of an earlier stage"] if begin < first else []
     if not stage.keeps_momentum:
         notes.append(
             f"the thermostat {stage.thermostat_kind} acts on each molecule: it slows diffusion and rotation, and "
@@ -125,8 +107,9 @@ def _rigid_frames(
             "frames; an analysis needs at least two: run longer, or write frames more often (trajectory_interval_ps)"
         )
     velocities = None if stored.velocities is None else stored.velocities[keep]
-    cells = stored.cells[keep]
-    bodies, corrections = fit_frames(system, stored.sites[keep], velocities, cells, stored.wrapped, progress)
+    cells = np.tile(NO_CELL, (len(keep), 1, 1)) if stored.cells is None else stored.cells[keep]
+    wrapped = system.scene.output.positions == "wrapped"
+    bodies, corrections = fit_frames(system, stored.positions[keep], velocities, cells, wrapped, progress)
     if not all(np.isfinite(array).all() for array in bodies if array is not None):
         raise OutputError("a frame has values that are not finite numbers")
     samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
@@ -164,10 +147,8 @@ def production_start(columns: dict[str, np.ndarray], of_stage: np.ndarray, box_m
     time = columns["time"][of_stage]
     if len(time) < MIN_SAMPLES:
         return float(time[0])
-    begin = 0
-    for name in ("potential", "density") if box_moves else ("potential",):
-        begin = max(begin, steady_from(columns[name][of_stage]))
-    return float(time[begin])
+    names = ("potential", "density") if box_moves else ("potential",)
+    return float(time[max(steady_from(columns[name][of_stage]) for name in names)])
 
 
 def steady_from(values: np.ndarray) -> int:

@@ -59,9 +59,9 @@ def _analyse(options: argparse.Namespace) -> int:
         if is_sweep(Path(options.folder)):
             return _analyse_sweep(Path(options.folder), request, progress)
         done = analyse_folder(Path(options.folder), request, progress)
-    frames = done.frames
-    print(f"{options.folder}: {len(frames)} frames from {frames.time[0]:g} to {frames.time[-1]:g} ps")
-    for note in frames.notes:
+    used = done.frames_used
+    print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")
+    for note in used["notes"]:
         print(f"  {note}")
     _print_results(done.results, done.failed)
     print(f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd report` shows them")

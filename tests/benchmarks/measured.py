@@ -55,7 +55,7 @@ def main() -> None:
     water = scene(options.model, options.count, options.density, options.duration, options.interval, only)
     Simulation(water, options.output).run(progress=True)
     done = analyse_folder(options.output, AnalysisRequest(only))
-    for told in [*done.frames.notes, *done.results]:
+    for told in [*done.frames_used["notes"], *done.results]:
         print(told)
 
 

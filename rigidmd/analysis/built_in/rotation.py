@@ -6,19 +6,9 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from rigidmd.analysis.built_in.translation import interval_and_lags
-from rigidmd.analysis.correlation import correlation, squared_displacement
+from rigidmd.analysis.built_in.transport import correlation, interval_and_lags, squared_displacement
 from rigidmd.analysis.registry import built_in
-from rigidmd.analysis.result import (
-    BLOCKS,
-    MIN_MOLECULAR_TIMES,
-    AnalysisResult,
-    Curve,
-    Value,
-    converged_value,
-    describe_so_far,
-    with_group_error,
-)
+from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, converged_value, too_short, with_group_error
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.errors import OutputError
 from rigidmd.io.formats import written
@@ -39,13 +29,6 @@ CLOSE = 0.5
 PER_CM = 0.0299792458
 
 
-def _rotating_species(frames: RigidFrames) -> list[Kind]:
-    found = [kind for kind in frames.moving if kind.molecule.degrees_of_freedom > 3]
-    if not found:
-        raise OutputError("no molecule of this run rotates")
-    return found
-
-
 def _axes(kind: Kind) -> list[int]:
     """Body axes that are defined: all three, or the axis of a linear molecule."""
     return [0] if rotational_freedom(kind.molecule.kind) == 2 else [0, 1, 2]
@@ -58,7 +41,8 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
     Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one. Rotational diffusion is
     the slope of the mean squared rotation about an axis of the body, summed over frames. Raises OutputError.
     """
-    kinds = _rotating_species(frames)
+    if not (kinds := [kind for kind in frames.moving if kind.molecule.degrees_of_freedom > 3]):
+        raise OutputError("no molecule of this run rotates")
     interval, lags = interval_and_lags(frames, "an orientational correlation")
     time = interval * np.arange(lags)
     found = AnalysisResult("orientation", "orientational correlation")
@@ -83,18 +67,17 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
                     # an exponential falls to HIGH at a lag, and a run is 2 BLOCKS times as long as its longest lag
                     need = 2 * BLOCKS * time[-1] * np.log(HIGH) / np.log(min(float(C[-1]), SLOWEST))
                     about = "about" if C[-1] < SLOWEST else "more than"
-                    note = (
+                    why = (
                         f"C{l + 1} is still {C[-1]:.2f} after {time[-1]:.3g} ps, too short for a value; it needs "
-                        f"{about} {need:.2g} ps. {describe_so_far(tau, None, 'ps')}"
+                        f"{about} {need:.2g} ps"
                     )
-                    found.values.append(Value(name, "ps", None, None, None, note))
+                    found.values.append(too_short(name, "ps", tau, None, why))
                     continue
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
                     note = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
-                found.values.append(
-                    converged_value(name, "ps", tau, error, frames.span, tau, note, MIN_MOLECULAR_TIMES)
-                )
+                value = converged_value(name, "ps", tau, error, frames.span, tau, note, BLOCKS)
+                found.values.append(value)
         found.values += _rotational_diffusion(frames, kind, interval, lags)
     return found
 
@@ -102,11 +85,10 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
 def _describe_axes(kind: Kind) -> str:
     """A note on the axis along the dipole of a molecule."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
-    size = float(np.linalg.norm(dipole))
     if kind.molecule.charge or not kind.molecule.has_dipole:
         return ""
     along = int(np.abs(dipole).argmax())
-    if abs(dipole[along]) < (1 - 1e-6) * size:
+    if abs(dipole[along]) < (1 - 1e-6) * float(np.linalg.norm(dipole)):
         return ""
     return f"axis {along + 1} of {kind.name} is along its dipole"
 
@@ -168,7 +150,7 @@ def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags
     values, errors = with_group_error(frames, kind, slopes)
     decay = 1 / (2 * max(float(values.mean()), 1e-300))
     return [
-        converged_value(name, "1/ps", float(D), float(error), frames.span, decay, least=MIN_MOLECULAR_TIMES)
+        converged_value(name, "1/ps", float(D), float(error), frames.span, decay, least=BLOCKS)
         for name, D, error in zip(names, values, errors, strict=True)
     ]
 
@@ -190,10 +172,8 @@ def spectrum(frames: RigidFrames) -> AnalysisResult:
     found.curves += [power, memory]
     for kind in frames.moving:
         if kind.molecule.degrees_of_freedom > 3:
-            title = f"correlation L {kind.name}"
-            memory.add(
-                title, *with_group_error(frames, kind, lambda part, group: _normalised(_lab_momenta(part, group), lags))
-            )
+            momenta = lambda part, group: _normalised(_lab_momenta(part, group), lags)  # noqa: E731
+            memory.add(f"correlation L {kind.name}", *with_group_error(frames, kind, momenta))
         for title, (weight, of) in _rates(kind).items():
             seen, errors = with_group_error(frames, kind, lambda part, group, of=of: _normalised(of(part, group), lags))
             if not seen[1] > CLOSE:

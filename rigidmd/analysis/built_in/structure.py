@@ -76,7 +76,8 @@ def rdf(
 
 def _thinned(frames: RigidFrames, enough: int) -> RigidFrames:
     """Evenly spaced frames with about `enough` molecules in total."""
-    return frames.thinned(min(MOST, max(FEWEST, enough // len(frames.system.model.species))))
+    most = min(MOST, max(FEWEST, enough // len(frames.system.model.species)))
+    return frames[:: max(1, -(-len(frames) // most))]
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:

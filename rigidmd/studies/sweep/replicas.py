@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.files import AnalysisRequest, analyse_folder, describe_range, write_results
+from rigidmd.analysis.files import AnalysisOutput, AnalysisRequest, analyse_folder, write_results
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.files import writing
 from rigidmd.core.statistics import standard_error
@@ -19,15 +19,6 @@ from rigidmd.studies.sweep.folder import FINISHED, Manifest, SweepPoint, read_ma
 from rigidmd.studies.sweep.table import key_columns
 
 ANALYSES = "analysis.csv"
-
-
-class AnalysedRun(NamedTuple):
-    """Results of one run, without its frames. frame_range : the frames used, see `describe_range`"""
-
-    results: list[AnalysisResult]
-    failed: dict[str, str]
-    frame_range: dict[str, Any]
-    files: list[Path]
 
 
 class Combination(NamedTuple):
@@ -56,7 +47,7 @@ def analyse_sweep(
     ready = [point for point in manifest.points if state_on_disk(folder, point) == FINISHED]
     if not ready:
         raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
-    done: dict[str, AnalysedRun] = {}
+    done: dict[str, AnalysisOutput] = {}
     failed: dict[str, str] = {}
     for k, point in enumerate(ready):
 
@@ -64,8 +55,7 @@ def analyse_sweep(
             progress((k + part) / len(ready), f"{point.folder} {name}")
 
         try:
-            one = analyse_folder(folder / point.folder, request, report_progress)
-            done[point.folder] = AnalysedRun(one.results, one.failed, describe_range(one.frames), one.files)
+            done[point.folder] = analyse_folder(folder / point.folder, request, report_progress)
         except OutputError as error:
             if len(ready) == 1:
                 raise
@@ -79,7 +69,7 @@ def analyse_sweep(
 
 
 def _combine(
-    folder: Path, manifest: Manifest, values: dict[str, Any], points: list[SweepPoint], done: dict[str, AnalysedRun],
+    folder: Path, manifest: Manifest, values: dict[str, Any], points: list[SweepPoint], done: dict[str, AnalysisOutput],
     failed: dict[str, str],
 ) -> Combination:  # fmt: skip
     """Means over the points of a combination; they are written if there are several."""
@@ -96,14 +86,14 @@ def _combine(
     where = folder / manifest.folder_of(values) if values else folder
     with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    frame_range = {
-        "stage": runs[0].frame_range["stage"],
-        "from_ps": min(run.frame_range["from_ps"] for run in runs),
-        "to_ps": max(run.frame_range["to_ps"] for run in runs),
-        "frames": sum(run.frame_range["frames"] for run in runs),
+    frames_used = {
+        "stage": runs[0].frames_used["stage"],
+        "from_ps": min(run.frames_used["from_ps"] for run in runs),
+        "to_ps": max(run.frames_used["to_ps"] for run in runs),
+        "frames": sum(run.frames_used["frames"] for run in runs),
         "notes": [f"means over {len(runs)} runs, errors from their scatter"],
     }
-    return Combination(title, values, len(runs), results, missed | why, write_results(where, frame_range, results, why))
+    return Combination(title, values, len(runs), results, missed | why, write_results(where, frames_used, results, why))
 
 
 def over_replicas(runs: list[list[AnalysisResult]]) -> list[AnalysisResult]:
