@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import sys
+from collections.abc import Callable
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +65,7 @@ def _sweep(options: argparse.Namespace) -> int:
 
     from rigidmd.errors import OutputError
     from rigidmd.studies.sweep.plan import parse_axes
-    from rigidmd.studies.sweep.sweeping import open_existing_sweep, open_sweep
+    from rigidmd.studies.sweep.sweeping import open_existing_sweep, open_sweep, write_slurm_script
 
     _check(options)
     folder = Path(options.output) if options.output else None
@@ -79,7 +80,16 @@ def _sweep(options: argparse.Namespace) -> int:
         sweep = open_sweep(stack, scene, axes, folder, options.replicas, options.trust, options.force)
         if options.collect or (options.to is not None and not sweep.left):
             return _collect(sweep)
-        return _run(options, sweep) if options.to is None else _write_slurm_script(options, sweep)
+        if options.to is None:
+            return _run(options, sweep)
+        threads = options.threads or 1
+        path, count = write_slurm_script(
+            sweep.folder, sweep.manifest, options.walltime, threads, options.trust, OUT_OF_TIME
+        )
+    print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
+    where = shlex.quote(str(sweep.folder))
+    print(f"  when all have ended: rigidmd sweep {shlex.quote(options.scene)} -o {where} --collect")
+    return 0
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -104,12 +114,13 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     from rigidmd.studies.sweep.backends import Cluster, Pool
     from rigidmd.studies.sweep.sweeping import SweepOutcome, jobs_and_threads, run_points
 
-    folder, manifest = sweep.folder, sweep.manifest
+    folder, manifest, outcome = sweep.folder, sweep.manifest, SweepOutcome()
     jobs, threads = jobs_and_threads(sweep.left, options.jobs, options.threads, sweep.is_body)
     if options.scheduler not in (None, "local"):
         threads = options.threads or 1  # a thread of a worker of dask for each point
     count = len(manifest.points)
-    print(f"{manifest.name}: {count} points in {folder}, {count - sweep.left} of them finished before", flush=True)
+    before = count - sweep.left
+    print(f"{manifest.name}: {count} points in {folder}, {before} of them finished before", flush=True)
     if sweep.left:
         if options.scheduler is None:
             runner = Pool(jobs, threads)
@@ -119,12 +130,10 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
         where = at_a_time if options.scheduler is None else f"on the cluster {options.scheduler}"
         print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
         with progress_of(sweep.left, "points", True) as bar:
-            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _Listener(bar).receive)
-    else:
-        outcome = SweepOutcome(skipped=[point.folder for point in manifest.points])
+            outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _shown_on(bar))
     _print_results(sweep)
     print(
-        f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {len(outcome.skipped)} skipped, "
+        f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {before} skipped, "
         f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
     )
     for point in manifest.points:
@@ -140,35 +149,32 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     return FAILED if outcome.failed or outcome.left else 0
 
 
-class _Listener:
-    """Shows messages of points: fractions as progress, warnings once each, failures at once."""
+def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
+    """A function that shows messages of points: fractions as progress, warnings once each, failures at once."""
+    from tqdm import tqdm
 
-    def __init__(self, bar: "Bar"):
-        self._bar = bar
-        self._fractions: dict[str, float] = {}
-        self._shown: set[str] = set()
+    fractions: dict[str, float] = {}
+    shown: set[str] = set()
 
-    def receive(self, name: str, kind: str, value: Any) -> None:
-        from tqdm import tqdm
-
+    def receive(name: str, kind: str, value: Any) -> None:
+        line = ""
         if kind in ("fraction", "ended", "died"):
-            before, begins = self._fractions.get(name, 0.0), kind == "fraction" and name not in self._fractions
-            ended = kind != "fraction"
-            now = value if not ended else (1.0 if kind == "ended" and value["state"] == "finished" else before)
-            if begins and not self._fractions:
-                self._bar.unpause()  # this is when the first steps begin
-            self._fractions[name] = max(before, now)
-            # what a resumed point had before
-            (self._bar.skip if begins else self._bar.update)(max(0.0, now - before))
-            why = value if kind == "died" else value["message"] if ended else None
-            if why:
-                tqdm.write(f"  {name}: {visible(why)}", file=sys.stderr)
-        elif kind == "announced" and value.startswith("compiling") and value not in self._shown:
-            self._shown.add(value)
-            tqdm.write(f"  {name}: {value} ...", file=sys.stderr)
-        elif kind == "warned" and value not in self._shown:
-            self._shown.add(value)
-            tqdm.write(f"rigidmd: warning: {name}: {visible(value)}", file=sys.stderr)
+            before, begins = fractions.get(name, 0.0), kind == "fraction" and name not in fractions
+            finished = kind == "ended" and value["state"] == "finished"
+            now = value if kind == "fraction" else 1.0 if finished else before
+            if begins and not fractions:
+                bar.unpause()  # this is when the first steps begin
+            fractions[name] = max(before, now)
+            (bar.skip if begins else bar.update)(max(0.0, now - before))  # skip what a resumed point had before
+            why = value if kind == "died" else value["message"] if kind == "ended" else None
+            line = f"  {name}: {visible(why)}" if why else ""
+        elif value not in shown and (kind == "warned" or (kind == "announced" and value.startswith("compiling"))):
+            shown.add(value)
+            line = f"rigidmd: warning: {name}: {visible(value)}" if kind == "warned" else f"  {name}: {value} ..."
+        if line:
+            tqdm.write(line, file=sys.stderr)
+
+    return receive
 
 
 def _print_results(sweep: "OpenSweep") -> None:
@@ -195,18 +201,6 @@ def _collect(sweep: "OpenSweep") -> int:
     return FAILED if sweep.left else 0
 
 
-def _write_slurm_script(options: argparse.Namespace, sweep: "OpenSweep") -> int:
-    from rigidmd.studies.sweep.sweeping import write_slurm_script
-
-    path, count = write_slurm_script(
-        sweep.folder, sweep.manifest, options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
-    )
-    print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
-    folder = shlex.quote(str(sweep.folder))
-    print(f"  when all have ended: rigidmd sweep {shlex.quote(options.scene)} -o {folder} --collect")
-    return 0
-
-
 def _run_point(options: argparse.Namespace) -> int:
     """`--point`: the point that a scheduler started."""
     if options.threads is not None:
@@ -215,15 +209,10 @@ def _run_point(options: argparse.Namespace) -> int:
         os.environ["NUMBA_NUM_THREADS"] = str(options.threads)  # before Numba is imported
     from rigidmd.studies.sweep.sweeping import run_point
 
-    def send(kind: str, value: Any) -> None:
-        if kind == "warned":
-            warn(value)
-        elif kind == "announced":
-            announce(value)
-
-    name, ended = run_point(
-        Path(options.output), options.point, Path(options.scene), options.walltime, options.trust, send
-    )
+    show = {"warned": warn, "announced": announce}
+    send = lambda kind, value: show[kind](value) if kind in show else None  # noqa: E731
+    folder, scene = Path(options.output), Path(options.scene)
+    name, ended = run_point(folder, options.point, scene, options.walltime, options.trust, send)
     print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")
     if ended["message"]:
         print(f"rigidmd: {name}: {visible(ended['message'])}", file=sys.stderr)

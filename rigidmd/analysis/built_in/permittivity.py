@@ -67,9 +67,8 @@ def dielectric(frames: RigidFrames) -> AnalysisResult:
     spread = relative_error * y * float(slope)
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
     note = f"{surroundings} around, {forces.electrostatics}; correlation time of the dipole {correlation:.3g} ps"
-    found.values.append(
-        converged_value("dielectric constant", "1", float(epsilon), spread, frames.span, correlation, note)
-    )
+    name, value = "dielectric constant", float(epsilon)
+    found.values.append(converged_value(name, "1", value, spread, frames.span, correlation, note))
     count = np.arange(1, len(dipole) + 1)
     sums = np.cumsum(np.einsum("fi,fi->f", dipole, dipole)), np.cumsum(dipole, axis=0)
     running = sums[0] / count - np.sum((sums[1] / count[:, None]) ** 2, axis=1)

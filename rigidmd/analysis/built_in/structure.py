@@ -10,6 +10,7 @@ from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, with_b
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.core.statistics import correlation_time, error_of_mean, mean_and_error
 from rigidmd.errors import OutputError
+from rigidmd.io.trajectory import near_pairs
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.scene.models import Molecule
 from rigidmd.units import GRAM_PER_CM3
@@ -39,8 +40,7 @@ def rdf(
     if not frames.has_box:
         raise OutputError("g(r) needs a box, which defines a density to compare with")
     half = 0.5 * float(min(heights(cell).min() for cell in frames.cell))
-    if largest is None:
-        largest = min(half, LARGEST)
+    largest = min(half, LARGEST) if largest is None else largest
     if not 0 < width < largest <= half * (1 + 1e-9):
         raise OutputError(
             f"g(r) up to {largest:g} Å in bins of {width:g} Å is not possible: half the box is {half:.4g} Å"
@@ -91,8 +91,7 @@ def _pairs(frames: RigidFrames) -> list[tuple[str, str]]:
         m = frames.kinds[0].molecule
         elements = dict.fromkeys(e for e, mass in zip(m.elements, m.masses, strict=True) if mass > 0 and e != "X")
         names = list(elements) or names
-    names = list(dict.fromkeys(names))
-    return list(combinations_with_replacement(names, 2))
+    return list(combinations_with_replacement(dict.fromkeys(names), 2))
 
 
 def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
@@ -117,7 +116,6 @@ def _peaks(
 
     frames (f, bins) : g(r) of each, every `gap` ps; parts : means of blocks; filled (bins,) : neighbours where g is 1
     """
-
     width = r[1] - r[0]
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
 
@@ -168,9 +166,8 @@ def _first_top(g: np.ndarray) -> int:
     above = np.flatnonzero(g > 1.0)
     if len(above) == 0:
         return 0
-    start = int(above[0])
-    top = start
-    for k in range(start, len(g)):
+    top = int(above[0])
+    for k in range(top, len(g)):
         if g[k] > g[top]:
             top = k
         elif g[k] < 1.0 and k - top > 2:
@@ -279,11 +276,9 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
         raise OutputError(
             "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine: there are no hydrogen bonds"
         )
-    from rigidmd.io.trajectory import near_pairs
-
     thinned = _thinned(frames, ENOUGH_MOLECULES)
     number = len(frames.system.model.species)
-    bonds = np.array([_bonds(thinned, k, distance, angle, near_pairs) for k in range(len(thinned))])  # (f, n)
+    bonds = np.array([_bonds(thinned, k, distance, angle) for k in range(len(thinned))])  # (f, n)
     each = bonds.mean(axis=1)
     value, error = mean_and_error(each)
     most = int(bonds.max()) + 1
@@ -302,9 +297,7 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
     """(heavy site, hydrogen) of the donors of a molecule."""
     heavy = [k for k, element in enumerate(molecule.elements) if element in BONDING]
     found = []
-    for h, element in enumerate(molecule.elements):
-        if element != "H":
-            continue
+    for h in (k for k, element in enumerate(molecule.elements) if element == "H"):
         gaps = np.linalg.norm(molecule.positions_body - molecule.positions_body[h], axis=1)
         gaps[[k for k in range(len(gaps)) if molecule.masses[k] == 0 or k == h]] = np.inf
         if (nearest := int(gaps.argmin())) in heavy:
@@ -312,17 +305,15 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
     return found
 
 
-def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float, near_pairs) -> np.ndarray:
+def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
     heavy, owner, giver, arm = [], [], [], []
-    at_frame = slice(frame, frame + 1)
     offset = 0
     for kind in frames.kinds:
-        centre = frames.positions[at_frame][0, kind.index]
+        centre = frames.positions[frame, kind.index]
         rotation = frames.Q[frame, kind.index] if frames.Q.shape[1] else np.eye(3)[None]
-        sites = [k for k, element in enumerate(kind.molecule.elements) if element in BONDING]
         body = kind.molecule.positions_body
-        for site in sites:
+        for site in (k for k, element in enumerate(kind.molecule.elements) if element in BONDING):
             heavy.append(centre + rotation @ body[site])
             owner.append(kind.index)
             for donor, hydrogen in _donors(kind.molecule):
@@ -338,8 +329,7 @@ def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float, near_
     different = who[both[:, 0]] != who[both[:, 1]]
     both, way = both[different], way[different]
     order = np.argsort(givers, kind="stable")
-    begin = np.searchsorted(givers[order], np.arange(len(at)))
-    end = np.searchsorted(givers[order], np.arange(len(at)), side="right")
+    begin, end = (np.searchsorted(givers[order], np.arange(len(at)), side=side) for side in ("left", "right"))
     counts = np.zeros(len(frames.system.model.species))
     for k in range(int((end - begin).max())):
         here = begin[both[:, 0]] + k < end[both[:, 0]]

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError
-from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, add_to_folder, is_empty, offsets_of, written_by_runs
+from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, is_empty, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
@@ -67,25 +67,13 @@ class Manifest:
         """Dotted key -> value of a point, for `Scene.read`."""
         return self.fixed | {key: value for first, value in point.values.items() for key in self.keys[first]}
 
-    def folder_of(self, values: dict[str, Any]) -> str:
-        """The name of the folder for means over the replicas of a combination of values."""
-        return point_name(values, short_keys(self.keys))
-
-    def describe(self, values: dict[str, Any]) -> str:
-        """Values for messages: temperature_K = 280, seed = 1."""
-        return describe_values(values, short_keys(self.keys))
-
     def combinations(self) -> list[tuple[dict[str, Any], list[SweepPoint]]]:
         """The values of all keys but `seed`, each with its points: its replicas, if the seed is swept."""
-        found: list[tuple[dict[str, Any], list[SweepPoint]]] = []
-        index_of: dict[str, int] = {}
+        found: dict[str, tuple[dict[str, Any], list[SweepPoint]]] = {}
         for point in self.points:
             values = {key: value for key, value in point.values.items() if key != SEED}
-            index = index_of.setdefault(json.dumps(values), len(found))
-            if index == len(found):
-                found.append((values, []))
-            found[index][1].append(point)
-        return found
+            found.setdefault(json.dumps(values), (values, []))[1].append(point)
+        return list(found.values())
 
 
 def is_sweep(folder: Path) -> bool:
@@ -129,13 +117,6 @@ def check_sweep_folder(folder: Path) -> None:
         raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
 
 
-def make_sweep_folder(folder: Path) -> None:
-    """Make it, and note the files that a sweep writes there. Raises OutputError."""
-    with writing(folder, "made", "; name another folder with -o"):
-        folder.mkdir(parents=True, exist_ok=True)
-    add_to_folder(folder, FILES)
-
-
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:
     """Remove the files of a sweep, and the files of runs in folders of these names. Raises OutputError."""
     for inner in [*(folder / name for name in names if Path(name).name == name), folder]:
@@ -155,13 +136,10 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
 def state_on_disk(folder: Path, point: SweepPoint) -> str:
     """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has run there."""
     inner = folder / point.folder
-    try:
+    with contextlib.suppress(OutputError):
         summary = read_json(inner / SUMMARY, Summary) or Summary(interrupted=True)
-        ended = not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256)
-    except OutputError:
-        ended = False
-    if ended:
-        return FINISHED
+        if not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256):
+            return FINISHED
     return INTERRUPTED if (inner / MARKER).is_file() else WAITING
 
 

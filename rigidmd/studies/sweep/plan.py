@@ -8,8 +8,9 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import product
-from math import inf
+from math import inf, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -134,9 +135,7 @@ def check_axes(axes: Sequence[Axis]) -> list[Axis]:
             "no key has several values: give it a list or a range, such as --set stages.0.temperature_K=280,290 or "
             "--set seed=1..8"
         )
-    count = 1
-    for axis in swept:
-        count *= len(axis.values)
+    count = prod(len(axis.values) for axis in swept)
     if count > MOST_POINTS:
         errors.append(f"these are {count} points; a sweep has {MOST_POINTS} at most")
     if errors:
@@ -161,11 +160,8 @@ def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
 
 def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
     """The values of the swept keys at each point, the last axis fastest; only the first of keys that vary together."""
-    swept = [axis for axis in axes if axis.swept]
-    return [
-        dict(zip((axis.keys[0] for axis in swept), values, strict=True))
-        for values in product(*(axis.values for axis in swept))
-    ]
+    swept = {axis.keys[0]: axis.values for axis in axes if axis.swept}
+    return [dict(zip(swept, values, strict=True)) for values in product(*swept.values())]
 
 
 def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
@@ -173,8 +169,7 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
 
     Raises SceneError with all errors of all points.
     """
-    swept = [axis for axis in axes if axis.swept]
-    keys = {axis.keys[0]: list(axis.keys) for axis in swept}
+    keys = {axis.keys[0]: list(axis.keys) for axis in axes if axis.swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
     every = settings(axes)
@@ -183,9 +178,8 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
     checked: dict[str, RigidMDError | None] = {}  # values without the seed -> error; one replica is built
     manifest, scene = None, None
     for values in every:
-        overrides = fixed | {key: value for first, value in values.items() for key in keys[first]}
         try:
-            scene = Scene.read(path, overrides)
+            scene = Scene.read(path, fixed | {key: value for first, value in values.items() for key in keys[first]})
             kind = json.dumps({key: value for key, value in values.items() if key != SEED}, default=str)
             if kind not in checked:
                 checked[kind] = _build_error(scene)
@@ -205,7 +199,11 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
             manifest = Manifest(scene.name, str(Path(path).absolute()), keys, fixed, common, inputs)
         manifest.points.append(SweepPoint(point_name(values, short), values, digest.of(scene)))
     if errors or manifest is None:
-        raise SceneError(str(path), [_describe_error(error, points, len(every)) for error, points in errors.items()])
+        described = []
+        for error, points in errors.items():
+            more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
+            described.append(error if 1 < len(points) == len(every) else f"at {points[0]}{more}: {error}")
+        raise SceneError(str(path), described)
     return manifest, isinstance(scene, BodyScene)
 
 
@@ -246,14 +244,6 @@ def _build_error(scene: MolecularScene | BodyScene) -> RigidMDError | None:
     return None
 
 
-def _describe_error(error: str, points: list[str], count: int) -> str:
-    """An error with the points that have it, unless all `count` points have it."""
-    if len(points) == count and count > 1:
-        return error
-    more = f" and {len(points) - 1} more points" if len(points) > 1 else ""
-    return f"at {points[0]}{more}: {error}"
-
-
 def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
     """The axes in the order of the sweep in a folder; a single value of a key that it varies is one more value."""
     if not is_sweep(folder):
@@ -272,7 +262,13 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> Manifest:
     if not is_sweep(folder):
         return fresh
     if force:
-        clear_sweep(folder, [*_existing_folders(folder), *(point.folder for point in fresh.points)])
+        names = [point.folder for point in fresh.points]
+        with suppress(OutputError):  # a manifest that cannot be read names no folders
+            there = read_manifest(folder)
+            short = short_keys(there.keys)
+            names += [point.folder for point in there.points]
+            names += [point_name(values, short) for values, _ in there.combinations() if values]  # of means
+        clear_sweep(folder, names)
         return fresh
     there = read_manifest(folder)
     if found := _differences_between(there, fresh):
@@ -295,24 +291,15 @@ def update_state(folder: Path, point: SweepPoint) -> None:
         point.state = found
 
 
-def _existing_folders(folder: Path) -> list[str]:
-    """Folders of points and of means over replicas; none if the manifest cannot be read."""
-    try:
-        there = read_manifest(folder)
-        means = [there.folder_of(values) for values, _ in there.combinations() if values]
-        return [*(point.folder for point in there.points), *means]
-    except OutputError:
-        return []
-
-
 def _differences_between(there: Manifest, now: Manifest) -> list[str]:
     """Differences that make another sweep: the keys that vary, values of other keys, files."""
     if there.keys != now.keys:
-        return [f"it varies {_list_keys(there.keys)}, not {_list_keys(now.keys)}"]
-    found = [
-        f"{key} is {_format_value(after)}, there {_format_value(before)}"
-        for key, (before, after) in differences(there.common, now.common).items()
-    ]
+        before, after = (" and ".join(map(", ".join, keys.values())) for keys in (there.keys, now.keys))
+        return [f"it varies {before}, not {after}"]
+    found = []
+    for key, values in differences(there.common, now.common).items():
+        before, after = (value if value == "left out" else shorten_repr(value) for value in values)
+        found.append(f"{key} is {after}, there {before}")
     found += [f"the file of {key} has changed" for key in differences(there.inputs, now.inputs)]
     if found:
         return found
@@ -322,11 +309,3 @@ def _differences_between(there: Manifest, now: Manifest) -> list[str]:
         for point in now.points
         if known.get(point.folder, point.scene_sha256) != point.scene_sha256
     ]
-
-
-def _list_keys(keys: dict[str, list[str]]) -> str:
-    return " and ".join(", ".join(together) for together in keys.values())
-
-
-def _format_value(value: Any) -> str:
-    return value if value == "left out" else shorten_repr(value)

@@ -15,7 +15,7 @@ from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.table import Column, Table, with_error
 from rigidmd.io.write import nine_digits
-from rigidmd.studies.sweep.folder import FINISHED, Manifest, SweepPoint, read_manifest, state_on_disk
+from rigidmd.studies.sweep.folder import FINISHED, describe_values, point_name, read_manifest, short_keys, state_on_disk
 from rigidmd.studies.sweep.table import key_columns
 
 ANALYSES = "analysis.csv"
@@ -50,44 +50,40 @@ def analyse_sweep(
     done: dict[str, AnalysisOutput] = {}
     failed: dict[str, str] = {}
     for k, point in enumerate(ready):
-
-        def report_progress(part: float, name: str, k: int = k, point: SweepPoint = point) -> None:
-            progress((k + part) / len(ready), f"{point.folder} {name}")
-
         try:
-            done[point.folder] = analyse_folder(folder / point.folder, request, report_progress)
+            done[point.folder] = analyse_folder(
+                folder / point.folder, request,
+                lambda part, name, k=k, point=point: progress((k + part) / len(ready), f"{point.folder} {name}"),
+            )  # fmt: skip
         except OutputError as error:
             if len(ready) == 1:
                 raise
             failed[point.folder] = str(error)
     if not done:
         raise OutputError(f"{folder}: no point can be analysed: {next(iter(failed.values()))}")
-    found = [_combine(folder, manifest, values, points, done, failed) for values, points in manifest.combinations()]
-    found = [combination for combination in found if combination.runs]
+    found, short = [], short_keys(manifest.keys)
+    for values, points in manifest.combinations():
+        runs = [done[point.folder] for point in points if point.folder in done]
+        missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
+        if runs:
+            where = folder / point_name(values, short) if values else folder
+            found.append(_combine(where, describe_values(values, short), values, runs, missed))
     _write_table(folder, found)
     return found
 
 
 def _combine(
-    folder: Path, manifest: Manifest, values: dict[str, Any], points: list[SweepPoint], done: dict[str, AnalysisOutput],
-    failed: dict[str, str],
-) -> Combination:  # fmt: skip
-    """Means over the points of a combination; they are written if there are several."""
-    title = manifest.describe(values)
-    runs = [done[point.folder] for point in points if point.folder in done]
-    missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
-    if not runs:
-        return Combination(title, values, 0, [], missed, [])
+    where: Path, title: str, values: dict[str, Any], runs: list[AnalysisOutput], missed: dict[str, str]
+) -> Combination:
+    """Means over the runs of a combination; they are written into a folder if there are several."""
     results = over_replicas([run.results for run in runs])
     names = {result.name for result in results}
     why = {name: reason for run in runs for name, reason in run.failed.items() if name not in names}
     if len(runs) < 2:
         return Combination(title, values, 1, results, missed | why, runs[0].files)
-    where = folder / manifest.folder_of(values) if values else folder
     with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    frames_used = {
-        "stage": runs[0].frames_used["stage"],
+    frames_used = runs[0].frames_used | {
         "from_ps": min(run.frames_used["from_ps"] for run in runs),
         "to_ps": max(run.frames_used["to_ps"] for run in runs),
         "frames": sum(run.frames_used["frames"] for run in runs),
@@ -106,21 +102,20 @@ def over_replicas(runs: list[list[AnalysisResult]]) -> list[AnalysisResult]:
 
 
 def _mean_of(results: list[AnalysisResult], runs: int) -> AnalysisResult:
-    first = results[0]
     if len(results) == 1:
-        return first
+        return results[0]
     names = dict.fromkeys(value.name for result in results for value in result.values)
     values = [_mean_value([v for f in results for v in f.values if v.name == name], runs) for name in names]
-    files = dict.fromkeys(curve.file for result in results for curve in result.curves)
     notes, curves = list(dict.fromkeys(note for result in results for note in result.notes)), []
-    for file in files:
-        of_file = [curve for result in results for curve in result.curves if curve.file == file]
-        curve = _mean_curve(of_file)
-        if curve is None:
-            notes.append(f"{of_file[0].label}: no mean, because the runs have no common range")
+    by_file: dict[str, list[Curve]] = {}
+    for curve in (curve for result in results for curve in result.curves):
+        by_file.setdefault(curve.file, []).append(curve)
+    for of_file in by_file.values():
+        if (mean := _mean_curve(of_file)) is not None:
+            curves.append(mean)
         else:
-            curves.append(curve)
-    return AnalysisResult(first.name, first.about, values, curves, notes)
+            notes.append(f"{of_file[0].label}: no mean, because the runs have no common range")
+    return AnalysisResult(results[0].name, results[0].about, values, curves, notes)
 
 
 def _mean_value(values: list[Value], runs: int) -> Value:
@@ -129,12 +124,8 @@ def _mean_value(values: list[Value], runs: int) -> Value:
         only = next((value for value in values if value.value is not None), values[0])
         return only._replace(note=f"of one of {runs} runs") if there else only
     note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
-    return Value(values[0].name, values[0].unit, *mean_over_replicas(np.array(there)), None, note)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
-def mean_over_replicas(values: np.ndarray) -> tuple[Any, Any]:
-    """Means over replicas (n, ...), and their standard errors."""
-    return values.mean(axis=0), standard_error(values)
+    mean, error = float(np.mean(there)), float(standard_error(there))
+    return Value(values[0].name, values[0].unit, mean, error, None, note)
 
 
 def _mean_curve(curves: list[Curve]) -> Curve | None:
@@ -146,22 +137,17 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
     if len(curves) == 1:
         return first
     header, axis = first.axis
-    same = all(len(curve.axis[1]) == len(axis) and np.allclose(curve.axis[1], axis, rtol=1e-9) for curve in curves)
-    if same:
+    if all(len(curve.axis[1]) == len(axis) and np.allclose(curve.axis[1], axis, rtol=1e-9) for curve in curves):
         kept, sampled = axis, [curve.columns for curve in curves]
     else:
         low, high = max(curve.axis[1].min() for curve in curves), min(curve.axis[1].max() for curve in curves)
         kept = axis[(axis >= low) & (axis <= high)]
         if len(kept) < 2:
             return None
-        sampled = [
-            {title: np.interp(kept, curve.axis[1], values) for title, values in curve.columns.items()}
-            for curve in curves
-        ]
-    columns, errors = {}, {}
-    for title in first.columns:
-        if all(title in one for one in sampled):
-            columns[title], errors[title] = mean_over_replicas(np.array([one[title] for one in sampled]))
+        sampled = [{t: np.interp(kept, c.axis[1], values) for t, values in c.columns.items()} for c in curves]
+    titles = [title for title in first.columns if all(title in one for one in sampled)]
+    columns = {title: np.mean([one[title] for one in sampled], axis=0) for title in titles}
+    errors = {title: standard_error([one[title] for one in sampled]) for title in titles}
     return Curve(first.file, (header, kept), first.label, columns, errors, first.log, first.level, first.bars)
 
 

@@ -5,28 +5,26 @@ import csv
 import os
 import shlex
 import signal
-import time
 import time as clock
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rigidmd.core.files import write_text
+from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
-from rigidmd.io.folder import FolderLock
+from rigidmd.io.folder import FolderLock, add_to_folder
 from rigidmd.run.checkpoints import checked_walltime
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, Pool
-from rigidmd.studies.sweep.figure import write_sweep_figure
 from rigidmd.studies.sweep.folder import (
     FAILED,
+    FILES,
     FINISHED,
     INTERRUPTED,
     RUNNING,
@@ -36,12 +34,11 @@ from rigidmd.studies.sweep.folder import (
     Manifest,
     SweepPoint,
     check_sweep_folder,
-    make_sweep_folder,
     read_manifest,
     write_manifest,
 )
 from rigidmd.studies.sweep.plan import Axis, axes_of, check_axes, merge_manifests, order_axes, read_points, update_state
-from rigidmd.studies.sweep.table import Table, table_of
+from rigidmd.studies.sweep.table import Table, table_of, write_sweep_figure
 from rigidmd.studies.sweep.worker import PointResult, PointTask, Send, run_task
 
 #: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this fraction.
@@ -109,12 +106,12 @@ def open_sweep(
     check_sweep_folder(folder)
     axes = check_axes(axes if force else order_axes(folder, axes))
     fresh, is_body = read_points(scene, axes)
-    lock = FolderLock(folder)
-    stack.callback(lock.release)
-    lock.take()
+    lock = stack.enter_context(FolderLock(folder))
     manifest = merge_manifests(folder, fresh, force)
-    make_sweep_folder(folder)
-    lock.take()
+    with writing(folder, "made", "; name another folder with -o"):
+        folder.mkdir(parents=True, exist_ok=True)
+    add_to_folder(folder, FILES)
+    lock.take()  # of a new folder
     write_manifest(folder, manifest)
     return OpenSweep(folder, manifest, is_body)
 
@@ -122,9 +119,7 @@ def open_sweep(
 def open_existing_sweep(folder: Path, stack: ExitStack) -> OpenSweep:
     """An existing sweep; the states of its points are read from their folders. Raises OutputError."""
     read_manifest(folder)  # before anything is written
-    lock = FolderLock(folder)
-    stack.callback(lock.release)
-    lock.take()
+    stack.enter_context(FolderLock(folder))
     manifest = read_manifest(folder)
     for point in manifest.points:
         update_state(folder, point)
@@ -148,10 +143,7 @@ def _with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str,
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
     """Points at a time, and threads of each, so that all cores have work. Given numbers are kept."""
     most = cores()
-    if threads is None and jobs is None:
-        jobs = max(1, min(most, count))
-    if jobs is None:
-        jobs = max(1, min(most // (threads or 1), count))
+    jobs = max(1, min(most // (threads or 1), count)) if jobs is None else jobs
     return jobs, threads or (1 if is_body else max(1, most // jobs))
 
 
@@ -209,7 +201,7 @@ def run_point(
     if k >= len(manifest.points):
         raise OutputError(f"{folder} has points 0 to {len(manifest.points) - 1}, not {k}")
     point, manifest.scene = manifest.points[k], str(scene.absolute())
-    ends_at = None if walltime is None else time.time() + walltime
+    ends_at = None if walltime is None else clock.time() + walltime
     return point.folder, run_task(task_of(folder, manifest, point, ends_at, trust), send, progress=True)
 
 
@@ -223,8 +215,7 @@ def write_slurm_script(
     path = folder.absolute() / SCRIPT
     left = [k for k, point in enumerate(manifest.points) if point.state != FINISHED]
     words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
-    for trusted in trust:
-        words += ["--trust", str(Path(trusted).absolute())]
+    words += [word for trusted in trust for word in ("--trust", str(Path(trusted).absolute()))]
     here = str(Path.cwd())
     check_script_paths([*words, str(path), here])
     text = SLURM_SCRIPT.format(
@@ -265,11 +256,10 @@ FOR_TABLE_FRACTION, LEAST_FRACTION = 0.1, 0.2
 
 @dataclass
 class SweepOutcome:
-    """How a sweep ended: names of points that finished, failed, had finished before, and are left."""
+    """How a sweep ended: names of points that finished, failed, and are left."""
 
     finished: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
     seconds: float = 0.0
     signal: int | None = None
@@ -290,7 +280,6 @@ def run_points(
     """
     began, found = clock.monotonic(), SweepOutcome()
     by_name = {point.folder: point for point in manifest.points}
-    found.skipped = [point.folder for point in manifest.points if point.state == FINISHED]
     waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
     changed, written = True, 0.0
     ends_at, least = None, 0.0
@@ -358,12 +347,11 @@ class Waiting:
     """Points that have not begun. One of those that compile the same code goes first, so that it is compiled once."""
 
     def __init__(self, manifest: Manifest, points: list[SweepPoint]):
-        self._kinds: dict[str, str] = {}
+        scenes = {point.folder: Scene.read(manifest.scene, manifest.overrides(point)) for point in points}
+        self._kinds = {name: code_kind(scene) for name, scene in scenes.items()}
         self._known: set[str] = set()  # kinds whose code is compiled
         self._first: str | None = None  # a point that compiles now
-        self._queue = deque(points)
-        for point in points:
-            self._kinds[point.folder] = code_kind(Scene.read(manifest.scene, manifest.overrides(point)))
+        self._queue = list(points)
 
     def __bool__(self) -> bool:
         return bool(self._queue)

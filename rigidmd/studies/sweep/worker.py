@@ -72,7 +72,7 @@ def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: b
 def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> None:
     from rigidmd.assemble.user_code.trust import trust
     from rigidmd.run import Every, Observer, Simulation
-    from rigidmd.scene import BodyScene, MolecularScene, Scene
+    from rigidmd.scene import BodyScene, Scene
     from rigidmd.studies.sweep.plan import Digests
 
     class Begun(Observer):
@@ -92,14 +92,10 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
         return
     walltime = None if task["ends_at"] is None else max(0.0, task["ends_at"] - clock.time())
     observers: list[Observer] = [Begun()]
-    if isinstance(scene, MolecularScene):
-        whole = sum(stage.duration for stage in scene.stages)
-    else:
-        whole = scene.run.duration_s if isinstance(scene, BodyScene) else 0.0
+    whole = scene.run.duration_s if isinstance(scene, BodyScene) else sum(stage.duration for stage in scene.stages)
     if whole > 0:
-        observers.append(
-            Every(whole / PROGRESS_REPORTS, lambda moment: send("fraction", min(1.0, moment.time / whole)))
-        )
+        fraction = lambda moment: send("fraction", min(1.0, moment.time / whole))  # noqa: E731
+        observers.append(Every(whole / PROGRESS_REPORTS, fraction))
     resume = scene.output.checkpoint_minutes is not False  # without checkpoints it starts again
     simulation = Simulation(
         scene, folder, not resume, observers=observers, say=lambda sentence: send("announced", sentence),
