@@ -4,8 +4,7 @@ import argparse
 from math import inf
 from pathlib import Path
 
-from rigidmd.commands.arguments import add_output_folder, add_scene, command, command_line, read_scene
-from rigidmd.commands.streams import progress_bar
+from rigidmd.commands.arguments import add_output_folder, add_scene, command, command_line, read_scene, write_study
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,9 +46,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 )  # fmt: skip
 def _accuracy(options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
-    from rigidmd.io.folder import FolderLock, check_folder, make_folder
+    from rigidmd.studies.accuracy import averages_report, report
     from rigidmd.studies.accuracy.accuracy import measure_accuracy
-    from rigidmd.studies.accuracy.report import FILES, recommendations, table_text, write_accuracy
+    from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
 
     scene = read_scene(options)
     folder = Path(options.output) if options.output else Path("runs") / f"{scene.name}-accuracy"
@@ -59,36 +58,21 @@ def _accuracy(options: argparse.Namespace) -> int:
     except ValueError:
         raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
     if options.averages == inf:
-        return _averages(options, scene, folder, integrators, timesteps)
+        sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
+        write_study(
+            folder, options.force, averages_report.FILES, "compiling, and running what comes before the last stage",
+            lambda progress: measure_averages(scene, integrators, timesteps, sample, progress),
+            lambda found: [averages_report.table_text(found), "", *averages_report.bias_conclusions(found)],
+            lambda folder, found: averages_report.write_averages(folder, found, command_line()),
+        )  # fmt: skip
+        return 0
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages without a PS"])
-    check_folder(folder, options.force, names=FILES)
-    with FolderLock(folder) as lock:
-        with progress_bar("compiling and running the reference") as progress:
-            found = measure_accuracy(
-                scene, integrators, timesteps, options.span, options.repeats, options.averages, progress
-            )
-        print(*recommendations(found), "", table_text(found), sep="\n")
-        make_folder(folder, FILES, lock)
-        written = write_accuracy(folder, found, command_line())
-    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
-    return 0
-
-
-def _averages(
-    options: argparse.Namespace, scene, folder: Path, methods: list[str] | None, timesteps: list[float] | None
-) -> int:
-    from rigidmd.io.folder import FolderLock, check_folder, make_folder
-    from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
-    from rigidmd.studies.accuracy.averages_report import FILES, bias_conclusions, table_text, write_averages
-
-    check_folder(folder, options.force, names=FILES)
-    sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
-    with FolderLock(folder) as lock:
-        with progress_bar("compiling, and running what comes before the last stage") as progress:
-            found = measure_averages(scene, methods, timesteps, sample, progress)
-        print(table_text(found), "", *bias_conclusions(found), sep="\n")
-        make_folder(folder, FILES, lock)
-        written = write_averages(folder, found, command_line())
-    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    settings = integrators, timesteps, options.span, options.repeats, options.averages
+    write_study(
+        folder, options.force, report.FILES, "compiling and running the reference",
+        lambda progress: measure_accuracy(scene, *settings, progress),
+        lambda found: [*report.recommendations(found), "", report.table_text(found)],
+        lambda folder, found: report.write_accuracy(folder, found, command_line()),
+    )  # fmt: skip
     return 0

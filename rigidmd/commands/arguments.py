@@ -9,6 +9,7 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.commands.streams import progress_bar
 from rigidmd.engines.registry import engine_options, runnable
 
 
@@ -158,6 +159,27 @@ def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[
 
 def command_line() -> str:
     return shlex.join(["rigidmd", *sys.argv[1:]])
+
+
+def write_study(
+    folder: Path, force: bool, files: tuple[str, ...], begins: str, measure: Callable[[Callable], Any],
+    describe: Callable[[Any], list[str]], write: Callable[[Path, Any], list[Path]],
+) -> Any:  # fmt: skip
+    """Measure something, print it and write its files into a folder, which is locked meanwhile. Returns what was found.
+
+    files : names of all files that `write` may write; begins : what begins when the arguments have been checked
+    """
+    from rigidmd.io.folder import FolderLock, check_folder, make_folder
+
+    check_folder(folder, force, names=files)
+    with FolderLock(folder) as lock:
+        with progress_bar(begins) as progress:
+            found = measure(progress)
+        print(*describe(found), sep="\n")
+        make_folder(folder, files, lock)
+        written = write(folder, found)
+    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    return found
 
 
 def print_page(path: Path, notes: list[str]) -> None:

@@ -8,7 +8,6 @@ import argparse
 import re
 import sys
 import warnings
-from collections.abc import Iterator
 from importlib import import_module
 from pkgutil import iter_modules
 
@@ -50,19 +49,15 @@ def main(arguments: list[str] | None = None) -> int:
         with warnings.catch_warnings(), checked_streams(lasting=options.writes):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
-    except SimulationError as error:
-        print(f"rigidmd: {error}", file=sys.stderr)
-        return FAILED
     except RigidMDError as error:
         print(f"rigidmd: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("rigidmd: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return FAILED if isinstance(error, SimulationError) else BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has gone: `rigidmd models | head`
         return 0
-    except Exception as error:  # libraries raise errors of many types for the causes below; all others are raised again
-        causes = list(_causes(error))
+    except (KeyboardInterrupt, Exception) as error:  # libraries raise errors of many types for the causes below
+        causes: list[BaseException] = [error]
+        while cause := causes[-1].__cause__ or causes[-1].__context__:
+            causes.append(cause)
         if any(isinstance(cause, KeyboardInterrupt) for cause in causes):
             print("rigidmd: interrupted", file=sys.stderr)
             return INTERRUPTED
@@ -74,13 +69,6 @@ def main(arguments: list[str] | None = None) -> int:
             print("rigidmd: not enough memory to load the program; raise the limit (ulimit -v)", file=sys.stderr)
             return BAD_INPUT
         raise
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and the errors that led to it."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
 
 
 def _parse(words: list[str]) -> argparse.Namespace:

@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import add_output_folder, command, command_line
-from rigidmd.commands.streams import progress_bar
+from rigidmd.commands.arguments import add_output_folder, command, command_line, write_study
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,17 +22,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _stability(options: argparse.Namespace) -> int:
     import platform
 
-    from rigidmd.io.folder import FolderLock, check_folder, make_folder
     from rigidmd.studies.stability.report import FILES, conclusions, has_failed, run_cases, table_text, write_stability
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
-    check_folder(folder, options.force, names=FILES)
-    with FolderLock(folder) as lock:
-        with progress_bar() as progress:
-            results = list(run_cases(options.case, options.quick, progress))
-        print(table_text(results), "", *conclusions(results), sep="\n")
-        make_folder(folder, FILES, lock)
-        machine = platform.processor() or platform.machine()
-        written = write_stability(folder, results, command_line(), machine)
-    print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
+    machine = platform.processor() or platform.machine()
+    results = write_study(
+        folder, options.force, FILES, "", lambda progress: list(run_cases(options.case, options.quick, progress)),
+        lambda results: [table_text(results), "", *conclusions(results)],
+        lambda folder, results: write_stability(folder, results, command_line(), machine),
+    )  # fmt: skip
     return FAILED if has_failed(results) else 0

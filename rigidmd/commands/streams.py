@@ -92,16 +92,13 @@ class _Checked:
         try:
             yield
         except OSError as error:
-            self._silence()
+            # further output goes to the null device, with what the stream still holds
+            with contextlib.suppress(OSError, ValueError):  # a stream in memory has no number, and does not fail
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
             if self._lasting:
                 return
             if isinstance(error, BrokenPipeError):
                 raise
             raise OutputError(f"standard output cannot be written: {error.strerror}") from None
-
-    def _silence(self) -> None:
-        """Send further output to the null device, with what the stream still holds."""
-        with contextlib.suppress(OSError, ValueError):  # a stream in memory has no number, and does not fail
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)

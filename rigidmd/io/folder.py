@@ -21,9 +21,12 @@ LOCK = ".rigidmd-lock"
 SWEEP = "sweep.json"
 
 
-def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: Iterable[str] = ()) -> None:
-    """Raise OutputError if a run cannot be written to a folder, or would remove one of its inputs. Changes nothing.
-    `names`: files that the run will write; existing ones must have been written by an earlier run."""
+def check_folder(
+    folder: Path, force: bool, inputs: Iterable[Path] = (), names: Iterable[str] = (), what: str = "run",
+    marker: str = MARKER,
+) -> None:  # fmt: skip
+    """Raise OutputError if a run, or another `what`, cannot be written to a folder, or would remove one of its inputs.
+    Changes nothing. `names`: files that it will write; existing ones must have been written by an earlier one."""
     try:
         exists = folder.exists()
     except OSError as error:  # a name that is too long
@@ -32,17 +35,17 @@ def check_folder(folder: Path, force: bool, inputs: Iterable[Path] = (), names: 
         if not folder.is_dir():
             raise OutputError(f"{folder} is a file; name another folder with -o")
         if not is_empty(folder):
-            if not (folder / MARKER).is_file():
-                raise OutputError(f"{folder} is not empty and holds no earlier run; name another folder with -o")
+            if not (folder / marker).is_file():
+                raise OutputError(f"{folder} is not empty and holds no earlier {what}; name another folder with -o")
             if not force:
                 resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
                 hint = f"{resume}--force replaces it, -o names another folder"
-                raise OutputError(f"{folder} holds an earlier run; {hint}")
-            replaced = {(folder / name).resolve() for name in written_by_runs(folder)}
+                raise OutputError(f"{folder} holds an earlier {what}; {hint}")
+            replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}
             if used := [path for path in inputs if path.resolve() in replaced]:
                 problem = f"{used[0]} is an input of this run and would be replaced"
                 raise OutputError(f"{problem}; name another folder with -o")
-            check_names(folder, names)
+            check_names(folder, names, marker)
     parent = folder
     while not parent.exists():
         parent = parent.parent

@@ -86,8 +86,12 @@ def compare(first: Path, second: Path) -> RunComparison:
         found.scene = differences(*(keys_of(scene, ("name", "threads")) for scene in scenes))
     summaries = [_read(folder / SUMMARY, found, lambda path: read_json(path, Summary)) for folder in (first, second)]
     if None not in summaries:
-        one, other = (_made(summary.model_dump(exclude_unset=True)) for summary in summaries)
-        found.made = differences(one, other, "not recorded")
+        made = []
+        for there in (summary.model_dump(exclude_unset=True) for summary in summaries):
+            of_run = {key.replace("_", " "): there[key] for key in VERSIONS_AND_MACHINE if key in there}
+            of_run |= {f"processor has {feature}": True for feature in there.get("processor_features", ())}
+            made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
+        found.made = differences(*made, "not recorded")
     for name in (LOG, MOTION):
         if any((folder / name).exists() for folder in (first, second)):
             tables = [_read(folder / name, found, read_columns) for folder in (first, second)]
@@ -97,26 +101,22 @@ def compare(first: Path, second: Path) -> RunComparison:
     for key in ("output.topology", "output.trajectory"):
         names = [keys_of(scene, ()).get(key) for scene in scenes if scene]
         if len(names) == 2 and isinstance(name := names[0], str) and names[1] == name and Path(name).name == name:
-            _compare_bytes(first / name, second / name, found)
+            paths = first / name, second / name
+            if missing := [f"{path}: {reason}" for path in paths if (reason := unreadable_reason(path))]:
+                found.missing += missing
+            else:
+                found.files[name] = filecmp.cmp(*paths, shallow=False)
     return found
-
-
-def _made(summary: dict[str, Any]) -> dict[str, Any]:
-    """The versions, the machine and the input files of a run."""
-    made = {key.replace("_", " "): summary[key] for key in VERSIONS_AND_MACHINE if key in summary}
-    made |= {f"processor has {feature}": True for feature in summary.get("processor_features", ())}
-    return made | {f"file of {key}": digest[:12] for key, digest in summary.get("input_sha256", {}).items()}
 
 
 def _read(path: Path, found: RunComparison, read: Callable[[Path], Any]) -> Any:
     """The content of a file; None, which `missing` explains, if it cannot be read."""
     try:
-        if (content := read(path)) is None:
-            found.missing.append(f"{path} does not exist")
-        return content
+        content, why = read(path), f"{path} does not exist"
     except RigidMDError as error:
-        found.missing.append(str(error))
-    return None
+        content, why = None, str(error)
+    found.missing += [why] if content is None else []
+    return content
 
 
 def _compare_samples(file: str, one: Columns, other: Columns) -> SampleComparison:
@@ -176,23 +176,14 @@ def _compare_states(first: Path, second: Path, found: RunComparison) -> None:
     """Find the largest difference of each array of two final states."""
     if not first.exists() and not second.exists():
         return
-    try:
-        one, other = read_state(first), read_state(second)
-    except RigidMDError as error:
-        found.missing.append(str(error))
+    one, other = (_read(path, found, read_state) for path in (first, second))
+    if one is None or other is None:
         return
     for name, a, b in zip(one.state._fields, one.state, other.state, strict=True):
         if a.shape != b.shape:
             found.state[name] = None
         elif a.tobytes() != b.tobytes():
             found.state[name] = float(np.abs(a - b).max())
-
-
-def _compare_bytes(first: Path, second: Path, found: RunComparison) -> None:
-    if missing := [f"{path}: {reason}" for path in (first, second) if (reason := unreadable_reason(path))]:
-        found.missing += missing
-        return
-    found.files[first.name] = filecmp.cmp(first, second, shallow=False)
 
 
 def describe_run_comparison(found: RunComparison) -> str:

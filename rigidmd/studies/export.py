@@ -1,6 +1,5 @@
 """`rigidmd export`: writes a scene as a folder that another engine runs by itself."""
 
-import os
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
@@ -11,8 +10,8 @@ from rigidmd.core.state import State
 from rigidmd.engines.registry import programs
 from rigidmd.engines.system import System
 from rigidmd.engines.translations import checked_view
-from rigidmd.errors import OutputError, SceneError
-from rigidmd.io.folder import SCENE, check_names, write_marker, written_by_runs
+from rigidmd.errors import SceneError
+from rigidmd.io.folder import SCENE, check_folder, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene
 from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
@@ -36,7 +35,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
     """
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body stays with rigidmd: export is for molecules"])
-    _check(folder, force)
+    check_folder(folder, force, what="export", marker=MARKER)
     program = programs()[to]
     # a scene for an engine that scenes cannot name has the defaults of rigidmd
     engine = EngineChoice.model_validate({"name": to}) if program.engine else EngineChoice()
@@ -66,19 +65,3 @@ def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
     scene = system.scene.model_copy(update={"engine": EngineChoice()})
     return Simulation(scene, warn=lambda sentence: None).settle()
-
-
-def _check(folder: Path, force: bool) -> None:
-    """Raise OutputError if an export cannot be written there; changes nothing."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name another folder with -o")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not (folder / MARKER).is_file():
-            raise OutputError(f"{folder} is not empty and holds no earlier export; name another folder with -o")
-        if not force:
-            raise OutputError(f"{folder} holds an earlier export; --force replaces it, -o names another folder")
-    parent = folder
-    while not parent.exists():
-        parent = parent.parent
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")

@@ -47,10 +47,10 @@ def measure_accuracy(
     known = (*scene.schemes, *COMPARATORS)
     integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
-        errors = [
-            f"unknown integrator {name}{did_you_mean(name, known)} (known: {', '.join(known)})" for name in unknown
-        ]
-        raise SceneError("--integrators", errors)
+        of_all = f"(known: {', '.join(known)})"
+        raise SceneError(
+            "--integrators", [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
+        )
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
         raise SceneError("accuracy", ["time steps, span, averages and repeats must be finite and greater than 0"])
@@ -58,7 +58,13 @@ def measure_accuracy(
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
     progress(0.0)
-    trial_system, base = _of_body(scene, span) if isinstance(scene, BodyScene) else _of_molecules(scene, span)
+    is_body = isinstance(scene, BodyScene)
+    if is_body:
+        trial_system, speed = body_trial_system(scene, span)
+        evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
+        base = RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations
+    else:
+        trial_system, base = _of_molecules(scene, span)
     if averages and trial_system.observe is None:
         raise SceneError(scene.source, ["--averages is for molecules in a box"])
     if refused := [name for name in integrators if name not in trial_system.methods]:
@@ -66,17 +72,13 @@ def measure_accuracy(
         raise SceneError(scene.source, reasons)
     left_out = {}
     if not integrators:
-        is_body = isinstance(scene, BodyScene)
         defaults = [name for name in DEFAULT_INTEGRATORS if is_body or name in SCHEMES]
         defaults += [row.name for row in scene.integrators]
         left_out = {name: why for name, why in trial_system.refused.items() if name in defaults}
         left_out |= {name: AT_A_POLE for name in trial_system.singular if name in defaults}
         of_scene = _method_name(scene.run.integrator if is_body else scene.stages[-1].integrator, scene)
-        integrators = [
-            name
-            for name in dict.fromkeys((*defaults, of_scene))
-            if name in trial_system.methods and name not in left_out
-        ]
+        candidates = dict.fromkeys((*defaults, of_scene))
+        integrators = [name for name in candidates if name in trial_system.methods and name not in left_out]
     steps = {
         name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
@@ -104,10 +106,3 @@ def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSyste
     trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
     trial_system.rounding = single_precision_errors(simulation.system, state)
     return trial_system, last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
-
-
-def _of_body(scene: BodyScene, span: float | None) -> tuple[TrialSystem, float]:
-    """As `_of_molecules`, in s."""
-    trial_system, speed = body_trial_system(scene, span)
-    evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
-    return trial_system, RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations

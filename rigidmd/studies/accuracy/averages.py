@@ -73,37 +73,33 @@ def measure_averages(
     plan: list[tuple[Stage, AverageRun]] = []
     for integrator, thermostat in pairs:
         scheme = schemes[integrator]
-        if timesteps:
-            steps = list(timesteps)
-        elif found is None:
-            steps = [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
-        else:
+        steps = timesteps or [ratio * stage.timestep_fs for ratio in LADDER_AROUND_SCENE]
+        if found is not None and not timesteps:
             exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
             steps = [round(step, 1 - floor(log10(step))) for step in exact]  # two digits, for tables and legends
         for step in sorted(set(steps)):
             cost = scheme.force_evaluations / (step * FEMTOSECOND)
-            plan.append((_with_method(stage, integrator, thermostat, step, sample), AverageRun(
-                integrator, thermostat, step, cost)))  # fmt: skip
+            run = AverageRun(integrator, thermostat, step, cost)
+            plan.append((_with_method(stage, integrator, thermostat, step, sample), run))
     whole = sum(run.forces_per_ps for _, run in plan)
     done = 0.0
     for changed, run in plan:
-        length = changed.duration
+        part, length = run.forces_per_ps / whole, changed.duration
 
-        def report_progress(moment, before=done, part=run.forces_per_ps / whole, length=length):
+        def report_progress(moment, before=done, part=part, length=length):
             progress(before + part * min(1.0, moment.time / length))
 
         _sample(scene, changed, state, run, sample, Every(length / 50, report_progress))
-        done += run.forces_per_ps / whole
+        done += part
         progress(done)
-    last = len(scene.stages) - 1
-    freedom = simulation.system.freedom_in(last)
+    freedom = simulation.system.freedom_in(len(scene.stages) - 1)
     count = len(simulation.system.model.species)
     thermal = BOLTZMANN * stage.temperatures[0]
     unit = thermal * freedom.total / count / KJ_PER_MOL
     quantities = [AveragedQuantity("U", "kJ/mol", unit, bias_unit="kT per degree of freedom", bias_size=unit)]
+    exact = stage.temperatures[0]
     for name, n in (("T_trans", freedom.translation), ("T_rot", freedom.rotation)):
         if n:
-            exact = stage.temperatures[0]
             unbiased = AveragedQuantity(f"{name} unbiased", "K", exact, exact, only="velocity_verlet")
             quantities += [AveragedQuantity(name, "K", exact, exact), unbiased]
     if stage.ensemble == "npt":
@@ -144,23 +140,18 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
 def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, str]:
     """Integrator and thermostat of "integrator+thermostat"; default: Langevin for baoab, else the stage's."""
     integrator, _, thermostat = (part.strip() for part in text.partition("+"))
-    if integrator not in known:
-        error = f"unknown integrator {integrator}{did_you_mean(integrator, known)} (known: {', '.join(known)})"
-        raise SceneError("--integrators", [error])
     thermostat = thermostat or ("langevin" if integrator in WITH_THERMOSTAT else stage.thermostat_kind)
-    if thermostat not in THERMOSTATS:
-        error = (
-            f"unknown thermostat {thermostat}{did_you_mean(thermostat, THERMOSTATS)} (known: {', '.join(THERMOSTATS)})"
-        )
-        raise SceneError("--integrators", [error])
+    for what, name, names in (("integrator", integrator, known), ("thermostat", thermostat, THERMOSTATS)):
+        if name not in names:
+            error = f"unknown {what} {name}{did_you_mean(name, names)} (known: {', '.join(names)})"
+            raise SceneError("--integrators", [error])
     return integrator, thermostat
 
 
 def _with_method(stage: Stage, integrator: str, thermostat: str, step: float, sample: float) -> Stage:
     """The stage by another method at another step; its settings of a thermostat or rotor are kept only for the same."""
-    changes = {"integrator": integrator, "thermostat": thermostat, "timestep_fs": step}
-    changes |= {"duration_ps": (1 + EQUILIBRATION) * sample}
-    changes |= dict.fromkeys(ERROR_TARGETS)
+    changes = dict.fromkeys(ERROR_TARGETS) | {"integrator": integrator, "thermostat": thermostat, "timestep_fs": step}
+    changes["duration_ps"] = (1 + EQUILIBRATION) * sample
     if thermostat != stage.thermostat_kind:
         changes["thermostat_time_ps"] = None
     if integrator != stage.integrator:

@@ -89,15 +89,13 @@ def methods_of(found: Averages) -> list[str]:
 def _describe_limits(found: Averages) -> list[str]:
     lines = []
     for quantity in found.quantities:
-        known = {method: at for method in methods_of(found) if (at := found.step_at_limit(method, quantity))}
         steps = [
-            f"{method} {step:.2g} fs" if seen else f"{method} none seen, more than {step:.2g} fs"
-            for method, (step, seen) in known.items()
+            f"{method} {'' if at[1] else 'none seen, more than '}{at[0]:.2g} fs"
+            for method in methods_of(found)
+            if (at := found.step_at_limit(method, quantity))
         ]
-        if steps:
-            lines.append(
-                f"{quantity.name} is off by {BIAS_LIMIT:.0%} of {describe_scale(quantity)} at: {'; '.join(steps)}"
-            )
+        scale = f"{BIAS_LIMIT:.0%} of {describe_scale(quantity)}"
+        lines += [f"{quantity.name} is off by {scale} at: {'; '.join(steps)}"] if steps else []
     return lines
 
 
@@ -105,12 +103,9 @@ def describe_failures(found: Averages) -> list[str]:
     """Sentences: which runs failed or were too short."""
     names = {quantity.name for quantity in found.quantities}
     failed = [(run, run.failure) for run in found.runs if run.failure]
+    why = f"{found.sampled:g} ps are too short for an error; sample longer (--sample-ps)"
     short = [(run, [name for name in run.short if name in names]) for run in found.runs]
-    failed += [
-        (run, f"{', '.join(missing)}: {found.sampled:g} ps are too short for an error; sample longer (--sample-ps)")
-        for run, missing in short
-        if missing
-    ]
+    failed += [(run, f"{', '.join(missing)}: {why}") for run, missing in short if missing]
     return [f"{run.method} at {run.timestep:g} fs: {reason}" for run, reason in failed]
 
 
@@ -148,8 +143,7 @@ def _quantity_to_json(found: Averages, quantity: AveragedQuantity) -> dict:
 def _run_to_json(found: Averages, run: AverageRun) -> dict:
     averages = {}
     for quantity in found.quantities:
-        point, bias = found.point(run, quantity), found.bias(run, quantity)
-        if point is not None and bias is not None:
+        if (point := found.point(run, quantity)) and (bias := found.bias(run, quantity)):
             numbers = (point.mean, point.error, *bias)
             averages[quantity.name] = dict(zip(("mean", "error", "bias", "bias_error"), numbers, strict=True))
     return {

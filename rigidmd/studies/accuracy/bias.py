@@ -141,12 +141,9 @@ class Averages:
         return MeanAtStep(run.method, run.timestep, *run.averages[quantity.name])
 
     def fit(self, quantity: AveragedQuantity) -> BiasFit | None:
-        if quantity.name not in self._fits:
-            points = self.points(quantity)
-            if not points:
-                return None
+        if quantity.name not in self._fits and (points := self.points(quantity)):
             self._fits[quantity.name] = extrapolate(points, quantity.exact)
-        return self._fits[quantity.name]
+        return self._fits.get(quantity.name)
 
     def bias(self, run: AverageRun, quantity: AveragedQuantity) -> tuple[float, float] | None:
         """Mean less limit and its error, in the quantity's unit of biases; None without a mean."""

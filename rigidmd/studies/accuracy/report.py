@@ -120,16 +120,19 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
     for why in dict.fromkeys(found.left_out.values()):
         lines.append(f"left out: {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}")
     lines += _describe_timings(found)
-    if found.sampled:
-        lines += _describe_temperatures(found)
+    name = "T_rot - T_trans"
+    if found.sampled and (verlet := [t for t in found.trials if f"{name} unbiased" in t.averages]):
+        longest = max(verlet, key=lambda t: t.timestep)
+        on, unbiased = (format_signed(*longest.averages[name + kind]) for kind in ("", " unbiased"))
+        lines.append(
+            f"velocity_verlet at {longest.timestep:.3g} fs: {name} is {on} K on the steps, {unbiased} unbiased"
+        )
     return lines
 
 
 def _describe_timings(found: IntegratorAccuracy) -> list[str]:
     timed = [trial for trial in found.trials if not trial.diverged]
-    if not timed:
-        return []
-    if timed[0].spread is None:
+    if timed and timed[0].spread is None:
         return ["timed once: the spread of the seconds is unknown; see --repeats"]
     doubtful = [(spread, trial) for trial in timed if (spread := trial.spread) is not None and spread > DOUBTFUL]
     if not doubtful:
@@ -140,19 +143,6 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
         f"warning: repeated timings of {len(doubtful)} of {len(timed)} trials differ by more than {DOUBTFUL:.0%}, "
         f"those of {which} by {spread:.0%} (± % in the table): was another program running? An idle machine or "
         "more --repeats help"
-    ]
-
-
-def _describe_temperatures(found: IntegratorAccuracy) -> list[str]:
-    """The effect of the longest step of velocity Verlet on the temperatures."""
-    name = "T_rot - T_trans"
-    verlet = [t for t in found.trials if f"{name} unbiased" in t.averages]
-    if not verlet:
-        return []
-    longest = max(verlet, key=lambda t: t.timestep)
-    on, unbiased = (format_signed(*longest.averages[name + kind]) for kind in ("", " unbiased"))
-    return [
-        f"velocity_verlet at {longest.timestep:.3g} fs: T_rot - T_trans is {on} K on the steps, {unbiased} unbiased"
     ]
 
 
@@ -234,14 +224,12 @@ def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> lis
 
 def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
     """Label points (time, error, step) in this order, each that is far enough from the one labelled before."""
-    if not points:
-        return
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     size = np.array([np.log(right / left), np.log(high / low)])
-    before = None
+    before = np.full(2, np.inf)
     for time, error, step in points:
         at = np.log([time, error]) / size
-        if before is None or np.abs(at - before)[0] > 0.06 or np.abs(at - before)[1] > 0.04:
+        if (np.abs(at - before) > [0.06, 0.04]).any():
             axis.annotate(f"{step:.2g}", (time, error), xytext=(-6, -6), textcoords="offset points", fontsize=7,
                           color=INK, ha="right", va="top")  # fmt: skip
             before = at
