@@ -142,9 +142,7 @@ def add_run_folder(parser: argparse.ArgumentParser, output: str) -> None:
 
 def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[str, ...]) -> Path:
     """The file to write. By default it is in the folder of the run, where it may be replaced; a new run removes it.
-
-    Raises OutputError.
-    """
+    Raises OutputError."""
     from rigidmd.io.folder import add_to_folder, check_is_run
     from rigidmd.io.write import check_target
 

@@ -60,15 +60,11 @@ def _print_value(name: str, value: float, unit: str, form: str = ">22.10g") -> N
 def _print_accuracy(error: dict[str, Any], unit: str) -> None:
     print(f"Coulomb forces on sites, compared with {error['reference']}")
     relative = f"{error['relative']:.2g} of it, {error['in_e2_per_A2']:.2g} e²/Å²"
-    lines = {
-        "rms force": (error["rms_force_per_A"], f"{unit}/Å"),
-        "rms error": (error["rms_error_per_A"], f"{unit}/Å: {relative}"),
-        "estimated": (error["estimated_per_A"], f"{unit}/Å"),
-        "largest error": (error["largest_error_per_A"], f"{unit}/Å"),
-        "error of the energy": (error["energy_error"], unit),
-    }
-    for name, (value, its_unit) in lines.items():
-        _print_value(name, value, its_unit, ">22.4g")
+    _print_value("rms force", error["rms_force_per_A"], f"{unit}/Å", ">22.4g")
+    _print_value("rms error", error["rms_error_per_A"], f"{unit}/Å: {relative}", ">22.4g")
+    _print_value("estimated", error["estimated_per_A"], f"{unit}/Å", ">22.4g")
+    _print_value("largest error", error["largest_error_per_A"], f"{unit}/Å", ">22.4g")
+    _print_value("error of the energy", error["energy_error"], unit, ">22.4g")
 
 
 def _body_energy(scene: "BodyScene", options: argparse.Namespace) -> int:

@@ -40,10 +40,8 @@ def progress_bar(begins: str = "") -> Iterator[Callable]:
 
 
 def open_streams() -> None:
-    """Open what was closed before the start, so that no file of a run gets the number of a standard stream.
-
-    What the encoding of a terminal lacks is written as an escape and does not end the run.
-    """
+    """Open what was closed before the start, so that no file of a run gets the number of a standard stream. What the
+    encoding of a terminal lacks is written as an escape and does not end the run."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)

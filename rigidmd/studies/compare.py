@@ -91,7 +91,7 @@ def compare(first: Path, second: Path) -> RunComparison:
             of_run = {key.replace("_", " "): there[key] for key in VERSIONS_AND_MACHINE if key in there}
             of_run |= {f"processor has {feature}": True for feature in there.get("processor_features", ())}
             made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
-        found.made = differences(*made, "not recorded")
+        found.made = differences(made[0], made[1], "not recorded")
     for name in (LOG, MOTION):
         if any((folder / name).exists() for folder in (first, second)):
             tables = [_read(folder / name, found, read_columns) for folder in (first, second)]
@@ -160,10 +160,8 @@ def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
 
 
 def last_bits(first: str, second: str) -> int | None:
-    """Number of the last bits of two numbers that differ: bits of the count of floats between them, at most 53.
-
-    None for text.
-    """
+    """Number of the last bits of two numbers that differ: bits of the count of floats between them, at most 53. None
+    for text."""
     try:
         numbers = np.array([float(first), float(second)]).view(np.int64)
     except ValueError:

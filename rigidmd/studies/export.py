@@ -29,10 +29,8 @@ class Exported(NamedTuple):
 
 
 def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported:
-    """Write a scene for an external engine. It starts after overlap removal and the first minimisations.
-
-    Raises SceneError with all that the engine cannot do, OutputError if the folder is in use.
-    """
+    """Write a scene for an external engine. It starts after overlap removal and the first minimisations. Raises
+    SceneError with all that the engine cannot do, OutputError if the folder is in use."""
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body stays with rigidmd: export is for molecules"])
     check_folder(folder, force, what="export", marker=MARKER)

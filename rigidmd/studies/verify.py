@@ -55,10 +55,8 @@ class Verification(NamedTuple):
 
 
 def verify(scene: Scene) -> Verification:
-    """Compare rigidmd with the engine that the scene names, both in double precision where that engine has it.
-
-    Raises SceneError with all that the other engine cannot do, EngineError if it is not installed.
-    """
+    """Compare rigidmd with the engine that the scene names, both in double precision where that engine has it. Raises
+    SceneError with all that the other engine cannot do, EngineError if it is not installed."""
     if not isinstance(scene, MolecularScene):
         raise SceneError(scene.source, ["a single body has no other engine: verify is for molecules"])
     if not scene.engine.is_external:
@@ -70,8 +68,7 @@ def verify(scene: Scene) -> Verification:
     other = external_engine(system)
     try:
         start = compare_at(system, state, system.engine_of(system.terms, "double"), other)
-        run = _short_run(system, state, other)
-        return Verification(scene.name, other.version, start, run)
+        return Verification(scene.name, other.version, start, _short_run(system, state, other))
     finally:
         other.close()
 

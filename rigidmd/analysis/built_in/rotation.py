@@ -54,8 +54,13 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
         for axis in _axes(kind):
 
             def compute(part: RigidFrames, group: Kind, axis=axis) -> np.ndarray:
-                both = _legendre(part, group, axis, lags)
-                return np.concatenate([both, [[_integral(c, interval)] for c in both]], axis=1)
+                """C1 and C2 of this axis, each followed by its integral (2, lags + 1)."""
+                u = part.Q[..., axis][:, group.index]
+                first = 3 * correlation(u, lags)
+                squares = np.stack([u[..., i] * u[..., i] for i in range(3)], axis=-1)
+                mixed = np.stack([u[..., i] * u[..., (i + 1) % 3] for i in range(3)], axis=-1)
+                second = 1.5 * 3 * (correlation(squares, lags) + 2 * correlation(mixed, lags)) - 0.5
+                return np.stack([np.append(c, _integral(c, interval)) for c in (first, second)])
 
             values, errors = with_group_error(frames, kind, compute)
             for l in (0, 1):  # noqa: E741
@@ -76,8 +81,7 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
                     note = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
-                value = converged_value(name, "ps", tau, error, frames.span, tau, note, BLOCKS)
-                found.values.append(value)
+                found.values.append(converged_value(name, "ps", tau, error, frames.span, tau, note, BLOCKS))
         found.values += _rotational_diffusion(frames, kind, interval, lags)
     return found
 
@@ -91,15 +95,6 @@ def _describe_axes(kind: Kind) -> str:
     if abs(dipole[along]) < (1 - 1e-6) * float(np.linalg.norm(dipole)):
         return ""
     return f"axis {along + 1} of {kind.name} is along its dipole"
-
-
-def _legendre(frames: RigidFrames, kind: Kind, axis: int, lags: int) -> np.ndarray:
-    """C1 and C2 (2, lags) of one axis."""
-    u = frames.Q[..., axis][:, kind.index]
-    first = 3 * correlation(u, lags)
-    squares = np.stack([u[..., i] * u[..., i] for i in range(3)], axis=-1)
-    mixed = np.stack([u[..., i] * u[..., (i + 1) % 3] for i in range(3)], axis=-1)
-    return np.stack([first, 1.5 * 3 * (correlation(squares, lags) + 2 * correlation(mixed, lags)) - 0.5])
 
 
 def _integral(values: np.ndarray, interval: float) -> float:
@@ -184,7 +179,13 @@ def spectrum(frames: RigidFrames) -> AnalysisResult:
             memory.add(f"correlation {title}", seen, errors)
 
             def states(part: RigidFrames, group: Kind, of=of, weight=weight / frames.thermal_energy) -> np.ndarray:
-                return _density_of_states(of(part, group), interval, size, weight)
+                """2 weight times the power of series (f, n, d) a wave number, sum over d and mean over n; cm."""
+                values, total = of(part, group), 0.0
+                for first in range(0, values.shape[1], 256):
+                    some = values[:, first : first + 256].reshape(len(values), -1)
+                    no: Any = False  # which the types of SciPy do not know
+                    total = total + signal.welch(some, 1 / interval, "hann", size, detrend=no, axis=0)[1].sum(axis=1)
+                return weight * np.asarray(total) * PER_CM / values.shape[1]
 
             power.add(title, *with_group_error(frames, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
@@ -221,14 +222,3 @@ def _lab_momenta(frames: RigidFrames, kind: Kind) -> np.ndarray:
 def _normalised(values: np.ndarray, lags: int) -> np.ndarray:
     seen = correlation(values, lags)
     return seen / seen[0]
-
-
-def _density_of_states(values: np.ndarray, interval: float, size: int, weight: float) -> np.ndarray:
-    """2 weight times the power of series (f, n, d) a wave number, sum over d and mean over n; cm."""
-    total, n = 0.0, values.shape[1]
-    for first in range(0, n, 256):
-        part = values[:, first : first + 256].reshape(len(values), -1)
-        no: Any = False  # which the types of SciPy do not know
-        _, density = signal.welch(part, 1 / interval, "hann", size, detrend=no, axis=0)
-        total = total + density.sum(axis=1)
-    return weight * np.asarray(total) * PER_CM / n

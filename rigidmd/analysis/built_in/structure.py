@@ -67,8 +67,7 @@ def rdf(
         curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
         if len(parts) > 1:
             curve.errors[title] = error_of_mean(parts)
-        gap = thinned.span / max(1, len(thinned) - 1)
-        found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, gap)
+        found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, thinned.span / max(1, len(thinned) - 1))
     if len(thinned) < len(frames):
         found.notes.append(f"of {len(thinned)} of {len(frames)} frames, evenly spaced")
     return found

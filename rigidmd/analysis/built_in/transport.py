@@ -30,10 +30,8 @@ def correlation(series: np.ndarray, lags: int) -> np.ndarray:
 
 
 def squared_displacement(path: np.ndarray, lags: int) -> np.ndarray:
-    """<|x(t) - x(0)|²> at the first `lags` lags, mean over origins and molecules; path (f, n, d).
-
-    From sums of squares and the correlation of positions (Calandrini et al. 2011, Collection SFN 12, 201).
-    """
+    """<|x(t) - x(0)|²> at the first `lags` lags, mean over origins and molecules; path (f, n, d). From sums of squares
+    and the correlation of positions (Calandrini et al. 2011, Collection SFN 12, 201)."""
     path = path - path.mean(axis=0)
     squares = np.einsum("fnd,fnd->f", path, path)
     n, frames = path.shape[1], len(path)

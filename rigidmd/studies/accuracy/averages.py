@@ -78,8 +78,7 @@ def measure_averages(
             exact = [ratio * stable_angle(scheme) / found.rate / FEMTOSECOND for ratio in LADDER]
             steps = [round(step, 1 - floor(log10(step))) for step in exact]  # two digits, for tables and legends
         for step in sorted(set(steps)):
-            cost = scheme.force_evaluations / (step * FEMTOSECOND)
-            run = AverageRun(integrator, thermostat, step, cost)
+            run = AverageRun(integrator, thermostat, step, scheme.force_evaluations / (step * FEMTOSECOND))
             plan.append((_with_method(stage, integrator, thermostat, step, sample), run))
     whole = sum(run.forces_per_ps for _, run in plan)
     done = 0.0

@@ -119,24 +119,20 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
 
 
 def to_json(found: Averages, command: str) -> dict:
-    quantities = {quantity.name: _quantity_to_json(found, quantity) for quantity in found.quantities}
+    quantities, methods = {}, methods_of(found)
+    for quantity in found.quantities:
+        quantities[quantity.name] = {"unit": quantity.unit}
+        if (fit := found.fit(quantity)) is not None:
+            steps = {method: at for method in methods if (at := found.step_at_limit(method, quantity))}
+            quantities[quantity.name] |= {
+                "bias_unit": _bias_unit(quantity), "reference": fit.limit, "reference_error": fit.limit_error,
+                "longest_step_in_fit_fs": fit.longest, "bias_limit": found.bias_limit(quantity),
+                "step_of_that_bias_fs": {name: {"step": step, "seen": seen} for name, (step, seen) in steps.items()},
+            }  # fmt: skip
     return {
         "command": command, "scene": found.name, "stage": found.stage, "temperature_K": found.temperature,
         "molecules": found.molecules, "degrees_of_freedom": found.freedom, "sampled_ps": found.sampled,
         "quantities": quantities, "runs": [_run_to_json(found, run) for run in found.runs],
-    }  # fmt: skip
-
-
-def _quantity_to_json(found: Averages, quantity: AveragedQuantity) -> dict:
-    fit = found.fit(quantity)
-    if fit is None:
-        return {"unit": quantity.unit}
-    steps = {method: at for method in methods_of(found) if (at := found.step_at_limit(method, quantity))}
-    return {
-        "unit": quantity.unit, "bias_unit": _bias_unit(quantity), "reference": fit.limit,
-        "reference_error": fit.limit_error, "longest_step_in_fit_fs": fit.longest,
-        "bias_limit": found.bias_limit(quantity),
-        "step_of_that_bias_fs": {method: {"step": step, "seen": seen} for method, (step, seen) in steps.items()},
     }  # fmt: skip
 
 

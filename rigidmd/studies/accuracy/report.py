@@ -273,8 +273,7 @@ def accuracy_figure(found: IntegratorAccuracy):
 
 
 def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
-    names = list(dict.fromkeys(t.integrator for t in found.trials))
-    colored = chips(names)
+    colored = chips(list(dict.fromkeys(t.integrator for t in found.trials)))
     unit = found.trial_system.time_unit
     rows = [
         [c.error, colored[c.integrator], f"{c.at.step:.2g}" + (f" ({c.at.limit})" if c.at.limit else ""),

@@ -115,8 +115,7 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
     """The outcome of a scene that starts from a file with the molecules of a state."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "start.npz"
-        template = data | {"start": {"temperature_K": 0.0}}
-        write_state(path, build(MolecularScene.from_dict(template)).saved(state))
+        write_state(path, build(MolecularScene.from_dict(data | {"start": {"temperature_K": 0.0}})).saved(state))
         started = data | {"structure": {"file": path.name, "velocities": velocities}}
         results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
     reported_error = energy_error(results)
@@ -216,8 +215,7 @@ def far_away(result: CaseResult, quick: bool) -> None:
 
     result.add("one exactly on a face", moved(state.position - state.position[0]), 1e-10, x=1.0)
     for shift in (1e3, 1e7, 1e12, 1e300) if quick else [10.0**k for k in (3, 5, 7, 9, 11, 13, 15, 18, 20, 100, 300)]:
-        boxes = np.round(shift / edge) * edge
-        away = np.where(np.arange(len(state.position))[:, None] % 2, boxes, 0.0)
+        away = np.where(np.arange(len(state.position))[:, None] % 2, np.round(shift / edge) * edge, 0.0)
         # positions have an error of eps times the distance; forces vary relatively by about ten per Å
         left = 1e3 * np.finfo(float).eps * shift
         expected = (RIGHT,) if left < 1e-3 else RIGHT_OR_REFUSED

@@ -35,8 +35,7 @@ def weak_thermostat(temperature: float, step: float) -> dict:
 def water_scene(model: str, *settings, **more) -> dict:
     """`molecules_scene` of a box of water. TIP4P of 1983 is not a shipped model."""
     kind = {"name": "tip4p", "sites": TIP4P} if model == "tip4p" else {"model": model}
-    box = {"density_g_cm3": 0.997}
-    return molecules_scene([kind | {"count": WATERS}], box, *settings, forces=WATER_FORCES, **more)
+    return molecules_scene([kind | {"count": WATERS}], {"density_g_cm3": 0.997}, *settings, forces=WATER_FORCES, **more)
 
 
 TIP4P = [

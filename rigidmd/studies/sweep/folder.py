@@ -175,9 +175,7 @@ def value_name(value: Any) -> str:
 def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
     """The name of a point's folder: temperature_K=280_seed=1."""
     name = "_".join(f"{short[key]}={value_name(value)}" for key, value in values.items())
-    if len(name) <= LONGEST:
-        return name
-    return f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def describe_values(values: Mapping[str, Any], short: Mapping[str, str]) -> str:

@@ -51,9 +51,7 @@ class Axis(NamedTuple):
 
 def parse_axis(text: str) -> Axis:
     """KEY=A,B,... of the command line; KEY=1..8 for whole numbers; KEY,KEY=A,B for keys that vary together.
-
-    `parse_override` reads the values. Commas in brackets or quotes do not separate values. Raises SceneError.
-    """
+    `parse_override` reads the values. Commas in brackets or quotes do not separate values. Raises SceneError."""
     name, equals, listed = text.partition("=")
     keys = tuple(key.strip() for key in name.split(","))
     if not equals or not all(keys):
@@ -165,10 +163,8 @@ def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
 
 
 def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
-    """The checked points of a sweep over a scene file, and whether the scene is a single body.
-
-    Raises SceneError with all errors of all points.
-    """
+    """The checked points of a sweep over a scene file, and whether the scene is a single body. Raises SceneError with
+    all errors of all points."""
     keys = {axis.keys[0]: list(axis.keys) for axis in axes if axis.swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
@@ -255,10 +251,8 @@ def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:
 
 
 def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> Manifest:
-    """The manifest of a folder with the points of `fresh`, which changes. States are read from the folders.
-
-    An existing sweep keeps its points. force : remove an existing sweep. Raises OutputError, also if its scene differs.
-    """
+    """The manifest of a folder with the points of `fresh`, which changes. States are read from the folders. An existing
+    sweep keeps its points. force : remove an existing sweep. Raises OutputError, also if its scene differs."""
     if not is_sweep(folder):
         return fresh
     if force:

@@ -129,10 +129,8 @@ def _mean_value(values: list[Value], runs: int) -> Value:
 
 
 def _mean_curve(curves: list[Curve]) -> Curve | None:
-    """The mean of curves in their common range, on the axis of the first; other axes are interpolated.
-
-    None if they have no range in common.
-    """
+    """The mean of curves in their common range, on the axis of the first; other axes are interpolated. None if they
+    have no range in common."""
     first = curves[0]
     if len(curves) == 1:
         return first

@@ -143,9 +143,7 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
 
 def summarise_run(record: Record) -> dict[str, Measured]:
     """Results of a run: for molecules means over the production of its last stage, for a body figures of its motion.
-
-    Raises OutputError.
-    """
+    Raises OutputError."""
     if record.is_body:
         return _summarise_motion(record)
     _, production = production_samples(record)
@@ -190,8 +188,7 @@ def table_text(table: Table) -> str:
     short, shown = short_keys(table.keys), [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns]
     keys = [Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys]
     means = [Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown]
-    runs = Column("runs", lambda row: str(len(row.runs)))
-    return ReportTable([*keys, runs, *means], table.rows).text(left=())
+    return ReportTable([*keys, Column("runs", lambda row: str(len(row.runs))), *means], table.rows).text(left=())
 
 
 DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"
