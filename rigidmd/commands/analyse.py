@@ -5,33 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidmd.commands.arguments import command, number, time_ps
+from rigidmd.commands.arguments import argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
 if TYPE_CHECKING:
     from rigidmd.analysis.files import AnalysisRequest
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", metavar="RUN", help="folder of a run, or of a sweep: means and errors over its runs")
-    parser.add_argument(
-        "--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
-        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them",
-    )  # fmt: skip
-    parser.add_argument(
-        "--from", dest="start", type=time_ps, metavar="TIME",
-        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
-        help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--trust", action="append", default=[], metavar="FILE.py",
-        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated",
-    )  # fmt: skip
-    parser.add_argument("--list", action=_List, nargs=0, help="list the analyses")
-    parser.set_defaults(scene="this run", writes=True)
 
 
 class _List(argparse.Action):
@@ -45,7 +23,26 @@ class _List(argparse.Action):
 
 @command(
     120, "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each with its error",
-    "rigidmd analyse runs/water --only rdf,diffusion --from 10ps", _arguments,
+    "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
+    argument("folder", metavar="RUN", help="folder of a run, or of a sweep: means and errors over its runs"),
+    argument(
+        "--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
+        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them",
+    ),
+    argument(
+        "--from", dest="start", type=time_ps, metavar="TIME",
+        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)",
+    ),
+    argument(
+        "--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
+        help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)",
+    ),
+    argument(
+        "--trust", action="append", default=[], metavar="FILE.py",
+        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated",
+    ),
+    argument("--list", action=_List, nargs=0, help="list the analyses"),
+    scene="this run", writes=True,
 )  # fmt: skip
 def _analyse(options: argparse.Namespace) -> int:
     from rigidmd.analysis.files import AnalysisRequest, analyse_folder

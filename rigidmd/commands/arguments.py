@@ -12,12 +12,16 @@ from typing import Any, NamedTuple
 from rigidmd.commands.streams import progress_bar
 from rigidmd.engines.registry import engine_options, runnable
 
+#: Adds an argument to the parser of a command.
+Argument = Callable[[argparse.ArgumentParser], object]
+
 
 class Command(NamedTuple):
     position: int  # in the list of `rigidmd --help`
     about: str
     example: str
-    arguments: Callable[..., object]
+    arguments: tuple[Argument, ...]
+    options: dict[str, Any]  # that no argument sets
     call: Callable[[argparse.Namespace], int]
 
 
@@ -25,20 +29,24 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {}
 
 
-def command(
-    position: int, about: str, example: str, arguments: Callable[..., object] = lambda parser: None
-) -> Callable:
+def command(position: int, about: str, example: str, *arguments: Argument, **options: Any) -> Callable:
     """Register a function as the command of its name, without underscores around it.
 
-    position : in the list of `rigidmd --help`; arguments(parser) : adds the arguments of the command
+    position : in the list of `rigidmd --help`; options : those that no argument sets, such as `writes=True` of a
+    command whose results are files, not what it prints
     The function is called with the options, and returns the exit code.
     """
 
     def register(call: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-        COMMANDS[call.__name__.strip("_")] = Command(position, about, example, arguments, call)
+        COMMANDS[call.__name__.strip("_")] = Command(position, about, example, arguments, options, call)
         return call
 
     return register
+
+
+def argument(*names: str, **settings: Any) -> Argument:
+    """An argument of a command, by its names and the settings of `argparse.ArgumentParser.add_argument`."""
+    return lambda parser: parser.add_argument(*names, **settings)
 
 
 def number(kind: type, least: float, most: float, description: str) -> Callable[[str], Any]:
@@ -74,20 +82,29 @@ def seconds(text: str) -> float:
     return found_seconds
 
 
-def add_output_folder(parser: argparse.ArgumentParser, default: str, earlier: str = "earlier results") -> None:
-    """Add -o and --force of a command that writes a folder."""
-    parser.add_argument("-o", "--output", metavar="DIR", help=f"folder (default: {default})")
-    parser.add_argument("--force", action="store_true", help=f"replace {earlier} in that folder")
-    parser.set_defaults(writes=True)
+def output_folder(default: str, earlier: str = "earlier results") -> tuple[Argument, Argument]:
+    """-o and --force of a command that writes a folder."""
+    return (
+        argument("-o", "--output", metavar="DIR", help=f"folder (default: {default})"),
+        argument("--force", action="store_true", help=f"replace {earlier} in that folder"),
+    )
 
 
-def add_trust(parser: argparse.ArgumentParser) -> None:
-    """Add --trust, for the Python files of forces of a scene."""
-    parser.add_argument(
-        "--trust", action="append", default=[], metavar="FILE.py",
-        help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
-        "you can; may be repeated",
-    )  # fmt: skip
+#: For the Python files of forces of a scene.
+TRUST = argument(
+    "--trust", action="append", default=[], metavar="FILE.py",
+    help="let [[forces.custom]] of the scene run this Python file, or a copy of it; it is code and can do whatever "
+    "you can; may be repeated",
+)  # fmt: skip
+#: SCENE, --set and --trust, which `read_scene` reads.
+SCENE = (
+    argument("scene", metavar="SCENE", help="scene file (TOML)"),
+    argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
+        help="override a key of the scene by its dotted path (an entry of a list by its number, counted from 0, or a "
+        "stage by its name); KEY= without a value removes the key; may be repeated",
+    ), TRUST,
+)  # fmt: skip
 
 
 def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", itself: bool = True) -> None:
@@ -102,19 +119,8 @@ def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", it
         parser.add_argument(f"--{key}", type=kind, metavar=metavar, help=text)
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
-    """Add SCENE, --set and --trust, which `read_scene` reads."""
-    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
-        help="override a key of the scene by its dotted path (an entry of a list by its number, counted from 0, or a "
-        "stage by its name); KEY= without a value removes the key; may be repeated",
-    )  # fmt: skip
-    add_trust(parser)
-
-
 def read_scene(options: argparse.Namespace, **more):
-    """The scene of the options of `add_scene` and `add_engine`; more : further keys to override."""
+    """The scene of the options of `SCENE` and `add_engine`; more : further keys to override."""
     from rigidmd.scene import Scene, parse_override
 
     if options.trust:
@@ -132,12 +138,13 @@ def read_scene(options: argparse.Namespace, **more):
     return scene
 
 
-def add_run_folder(parser: argparse.ArgumentParser, output: str) -> None:
-    """Add RUN, -o and --force of a command that writes a file about a run."""
-    parser.add_argument("folder", metavar="RUN", help="folder of a run")
-    parser.add_argument("-o", "--output", metavar="FILE", help=output)
-    parser.add_argument("--force", action="store_true", help="replace that file")
-    parser.set_defaults(scene="this run", writes=True)
+def run_folder(output: str) -> tuple[Argument, Argument, Argument]:
+    """RUN, -o and --force of a command that writes a file about a run."""
+    return (
+        argument("folder", metavar="RUN", help="folder of a run"),
+        argument("-o", "--output", metavar="FILE", help=output),
+        argument("--force", action="store_true", help="replace that file"),
+    )
 
 
 def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[str, ...]) -> Path:

@@ -2,16 +2,11 @@
 
 import argparse
 
-from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene
+from rigidmd.commands.arguments import SCENE, add_engine, command, read_scene
 from rigidmd.commands.streams import warn
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_scene(parser)
-    add_engine(parser)
-
-
-@command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", _arguments)
+@command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine)
 def _check(options: argparse.Namespace) -> int:
     from rigidmd.assemble.describe import describe
     from rigidmd.run.pilot.stable_step import step_warnings

@@ -101,8 +101,9 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
         description, epilog = command.about[0].upper() + command.about[1:] + ".", f"example:\n  {command.example}"
         texts = {"help": command.about, "description": description, "epilog": epilog, "formatter_class": form}
         of_command = commands.add_parser(name, **texts)
-        of_command.set_defaults(command=command.call, writes=False)  # writes: its results are files, not what it prints
-        command.arguments(of_command)
+        of_command.set_defaults(command=command.call, **{"writes": False} | command.options)
+        for add in command.arguments:
+            add(of_command)
     return parser, commands.choices
 
 

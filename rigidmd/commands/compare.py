@@ -5,19 +5,16 @@ import json
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import command
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("first", metavar="RUN", help="folder of a run")
-    parser.add_argument("second", metavar="RUN", help="folder of another run")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+from rigidmd.commands.arguments import argument, command
 
 
 @command(
     50, "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same to "
     "the last bit, else 1",
-    "rigidmd compare runs/water runs/water2", _arguments,
+    "rigidmd compare runs/water runs/water2",
+    argument("first", metavar="RUN", help="folder of a run"),
+    argument("second", metavar="RUN", help="folder of another run"),
+    argument("--json", action="store_true", help="print JSON"),
 )  # fmt: skip
 def _compare(options: argparse.Namespace) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison

@@ -4,23 +4,20 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from rigidmd.commands.arguments import add_scene, command, read_scene
+from rigidmd.commands.arguments import SCENE, argument, command, read_scene
 
 if TYPE_CHECKING:
     from rigidmd.scene import BodyScene
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_scene(parser)
-    units = ["kJ/mol", "kcal/mol", "eV", "K"]
-    parser.add_argument("--unit", choices=units, help="unit of energy (kJ/mol; J for a body)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
+@command(
+    60, "energies and forces of the start", "rigidmd energy water_dimer.toml --json", *SCENE,
+    argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], help="unit of energy (kJ/mol; J for a body)"),
+    argument("--json", action="store_true", help="print JSON"),
+    argument(
         "--accuracy", action="store_true", help="also measure the error of the Coulomb forces (Ewald sums and PME)"
-    )
-
-
-@command(60, "energies and forces of the start", "rigidmd energy water_dimer.toml --json", _arguments)
+    ),
+)  # fmt: skip
 def _energy(options: argparse.Namespace) -> int:
     from rigidmd.run import Simulation
     from rigidmd.scene import BodyScene

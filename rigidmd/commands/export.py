@@ -4,20 +4,17 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import add_output_folder, add_scene, command, read_scene
+from rigidmd.commands.arguments import SCENE, command, output_folder, read_scene
 from rigidmd.engines.registry import programs
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_scene(parser)
-    names = [name for name, program in programs().items() if program.writer]
-    parser.add_argument("--to", required=True, choices=names, help="the engine")
-    add_output_folder(parser, "NAME-ENGINE", "an earlier export")
 
 
 @command(
     80, "write a scene as a folder that runs on another engine by itself",
-    "rigidmd export water_pme.toml --to lammps -o water_lammps", _arguments,
+    "rigidmd export water_pme.toml --to lammps -o water_lammps", *SCENE,
+    lambda parser: parser.add_argument(
+        "--to", required=True, choices=[name for name, of in programs().items() if of.writer], help="the engine"
+    ),
+    *output_folder("NAME-ENGINE", "an earlier export"), writes=True,
 )  # fmt: skip
 def _export(options: argparse.Namespace) -> int:
     from rigidmd.studies.export import export

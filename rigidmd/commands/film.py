@@ -3,20 +3,24 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import add_run_folder, command, file_about_run, number
+from rigidmd.commands.arguments import argument, command, file_about_run, number, run_folder
 from rigidmd.commands.streams import progress_bar
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_run_folder(parser, ".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)")
-    length = number(float, 0.1, 3600, "a number of seconds from 0.1 to 3600")
-    height = number(int, 100, 2160, "a number of pixels from 100 to 2160")
-    parser.add_argument("--seconds", type=length, default=10.0, metavar="S", help="length of the film (default: 10)")
-    parser.add_argument("--height", type=height, metavar="N", help="pixels (default: 640, of a .gif 448)")
-    parser.add_argument("--plots", action="store_true", help="put plots with a moving cursor next to it")
-
-
-@command(150, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots", _arguments)
+@command(
+    150, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots",
+    *run_folder(".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)"),
+    argument(
+        "--seconds", type=number(float, 0.1, 3600, "a number of seconds from 0.1 to 3600"), default=10.0, metavar="S",
+        help="length of the film (default: 10)",
+    ),
+    argument(
+        "--height", type=number(int, 100, 2160, "a number of pixels from 100 to 2160"), metavar="N",
+        help="pixels (default: 640, of a .gif 448)",
+    ),
+    argument("--plots", action="store_true", help="put plots with a moving cursor next to it"),
+    scene="this run", writes=True,
+)  # fmt: skip
 def _film(options: argparse.Namespace) -> int:
     from rigidmd.view.animation import EXTENSIONS, check_writer, default_name, write_film
 

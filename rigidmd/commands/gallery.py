@@ -4,20 +4,17 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import command, print_page
+from rigidmd.commands.arguments import argument, command, print_page
 from rigidmd.commands.streams import announce
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)")
-    parser.add_argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)")
-    parser.add_argument("--force", action="store_true", help="replace an earlier gallery in that folder")
-    parser.set_defaults(scene="the gallery", writes=True)
 
 
 @command(
     160, "run shipped bodies and write a page with a picture of each, which leads to its film",
-    "rigidmd gallery heavy_top_3 intermediate_axis", _arguments,
+    "rigidmd gallery heavy_top_3 intermediate_axis",
+    argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"),
+    argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
+    argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
+    scene="the gallery", writes=True,
 )  # fmt: skip
 def _gallery(options: argparse.Namespace) -> int:
     from rigidmd.io.write import check_target

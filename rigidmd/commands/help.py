@@ -2,14 +2,13 @@
 
 import argparse
 
-from rigidmd.commands.arguments import command
+from rigidmd.commands.arguments import argument, command
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them")
-
-
-@command(190, "list the chapters of the documentation, or print one", "rigidmd help water | less", _arguments)
+@command(
+    190, "list the chapters of the documentation, or print one", "rigidmd help water | less",
+    argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them"),
+)  # fmt: skip
 def _help(options: argparse.Namespace) -> int:
     from rigidmd.core.shipped import chapter_text, contents
 

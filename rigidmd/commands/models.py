@@ -4,33 +4,29 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import command
+from rigidmd.commands.arguments import argument, command
 from rigidmd.commands.streams import warn
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", nargs="?", metavar="NAME", help="model to show, or the .toml file of a custom model")
-    parser.add_argument("--draw", action="store_true", help="draw it to NAME.png")
-    parser.add_argument(
-        "--from", dest="geometry", metavar="FILE",
-        help="write a custom model: a structure file with one molecule, of any format that a scene reads",
-    )  # fmt: skip
-    parser.add_argument(
-        "--parameters", metavar="TABLE",
-        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element",
-    )  # fmt: skip
-    parser.add_argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model")
-    parser.add_argument(
-        "-o", "--output", metavar="FILE",
-        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)",
-    )  # fmt: skip
-    parser.add_argument("--force", action="store_true", help="replace that file")
 
 
 @command(
     170, "list the molecular models that rigidmd ships, show or draw one, or write a custom model",
     "rigidmd models tip4p2005 --draw -o water.svg\n  rigidmd models --from dye.xyz --parameters table.toml -o dye.toml",
-    _arguments,
+    argument("model", nargs="?", metavar="NAME", help="model to show, or the .toml file of a custom model"),
+    argument("--draw", action="store_true", help="draw it to NAME.png"),
+    argument(
+        "--from", dest="geometry", metavar="FILE",
+        help="write a custom model: a structure file with one molecule, of any format that a scene reads",
+    ),
+    argument(
+        "--parameters", metavar="TABLE",
+        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element",
+    ),
+    argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model"),
+    argument(
+        "-o", "--output", metavar="FILE",
+        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)",
+    ),
+    argument("--force", action="store_true", help="replace that file"),
 )  # fmt: skip
 def _models(options: argparse.Namespace) -> int:
     from rigidmd.errors import MoleculeError

@@ -4,16 +4,15 @@ import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import command
+from rigidmd.commands.arguments import argument, command
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them")
-    parser.add_argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)")
-    parser.add_argument("--force", action="store_true", help="replace that file")
-
-
-@command(20, "copy a shipped scene, notebook or script to start from", "rigidmd new water -o mine.toml", _arguments)
+@command(
+    20, "copy a shipped scene, notebook or script to start from", "rigidmd new water -o mine.toml",
+    argument("name", metavar="NAME", help="which one; `rigidmd examples` lists them"),
+    argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)"),
+    argument("--force", action="store_true", help="replace that file"),
+)  # fmt: skip
 def _new(options: argparse.Namespace) -> int:
     from rigidmd.core.shipped import copy_example, find_example, series_of
     from rigidmd.scene import Scene

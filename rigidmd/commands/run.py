@@ -5,36 +5,33 @@ import shlex
 from pathlib import Path
 
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
-from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene, seconds, time_ps
+from rigidmd.commands.arguments import SCENE, add_engine, argument, command, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
 
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_scene(parser)
-    parser.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)")
-    parser.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
-    parser.add_argument(
-        "--resume", action="store_true",
-        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start",
-    )  # fmt: skip
-    add_engine(parser)
-    add_duration(parser)
-
-
-def add_duration(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(writes=True)
-    parser.add_argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)")
-    parser.add_argument(
+#: Options of a run that begins or continues.
+DURATION = (
+    argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"),
+    argument(
         "--walltime", type=seconds, metavar="H:MM:SS",
         help="stop shortly before this time is up, with a checkpoint and exit code 75",
-    )  # fmt: skip
-    parser.add_argument(
+    ),
+    argument(
         "--until", type=time_ps, metavar="TIME",
         help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
-    )  # fmt: skip
+    ),
+)  # fmt: skip
 
 
-@command(30, "run a scene", "rigidmd run water.toml -o runs/water", _arguments)
+@command(
+    30, "run a scene", "rigidmd run water.toml -o runs/water", *SCENE,
+    argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)"),
+    argument("--force", action="store_true", help="replace an earlier run in that folder"),
+    argument(
+        "--resume", action="store_true",
+        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start",
+    ),
+    add_engine, *DURATION, writes=True,
+)  # fmt: skip
 def run(options: argparse.Namespace) -> int:
     from rigidmd.scene import BodyScene
 

@@ -4,20 +4,16 @@ import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import add_output_folder, command, command_line, write_study
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes")
-    parser.add_argument("--case", action="append", metavar="NAME", help="only this case; may be repeated")
-    add_output_folder(parser, "runs/stability")
-    parser.set_defaults(scene="stability")
+from rigidmd.commands.arguments import argument, command, command_line, output_folder, write_study
 
 
 @command(
     110,
     "try to break the engine: named cases, each compared with a known answer; exit code 1 if an error is undetected",
-    "rigidmd stability --quick --case near_linear --case water_steps", _arguments,
+    "rigidmd stability --quick --case near_linear --case water_steps",
+    argument("--quick", action="store_true", help="fewer settings, integrators and steps: minutes"),
+    argument("--case", action="append", metavar="NAME", help="only this case; may be repeated"),
+    *output_folder("runs/stability"), scene="stability", writes=True,
 )  # fmt: skip
 def _stability(options: argparse.Namespace) -> int:
     import platform

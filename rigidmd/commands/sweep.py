@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigidmd.commands import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME
-from rigidmd.commands.arguments import add_output_folder, add_trust, command, number, seconds
+from rigidmd.commands.arguments import TRUST, argument, command, number, output_folder, seconds
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import visible
 
@@ -18,39 +18,7 @@ if TYPE_CHECKING:
     from rigidmd.studies.sweep.sweeping import OpenSweep
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    count = number(int, 1, 4096, "a number from 1 to 4096")
-    seeds = number(int, 2, 10000, "a number of replicas from 2 on")
-    index = number(int, 0, inf, "the number of a point, from 0 on")
-    parser.add_argument("scene", metavar="SCENE", help="scene file (TOML)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
-        help="values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for whole numbers; "
-        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run",
-    )  # fmt: skip
-    parser.add_argument(
-        "--replicas", type=seeds, metavar="N", help="run N seeds, from the scene's seed on: errors from their scatter"
-    )
-    add_output_folder(parser, "runs/NAME-sweep", "an earlier sweep")
-    parser.add_argument("--jobs", type=count, metavar="N", help="points at a time (default: as many as fill all cores)")
-    parser.add_argument("--threads", type=count, metavar="N", help="threads of each point (default: cores over jobs)")
-    parser.add_argument(
-        "--walltime", type=seconds, metavar="H:MM:SS",
-        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job",
-    )  # fmt: skip
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS",
-        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here",
-    )  # fmt: skip
-    parser.add_argument(
-        "--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"
-    )
-    parser.add_argument(
-        "--collect", action="store_true", help="run nothing, and write table and figure of existing results"
-    )
-    parser.add_argument("--point", type=index, metavar="K", help="run point K of an existing sweep, counted from 0")
-    add_trust(parser)
-    parser.set_defaults(overrides=[])
+COUNT = number(int, 1, 4096, "a number from 1 to 4096")
 
 
 @command(
@@ -58,7 +26,34 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     "rigidmd sweep water.toml --set stages.0.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
     "  rigidmd sweep water.toml --replicas 8\n"
     "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
-    _arguments,
+    argument("scene", metavar="SCENE", help="scene file (TOML)"),
+    argument(
+        "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
+        help="values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for whole numbers; "
+        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run",
+    ),
+    argument(
+        "--replicas", type=number(int, 2, 10000, "a number of replicas from 2 on"), metavar="N",
+        help="run N seeds, from the scene's seed on: errors from their scatter",
+    ),
+    *output_folder("runs/NAME-sweep", "an earlier sweep"),
+    argument("--jobs", type=COUNT, metavar="N", help="points at a time (default: as many as fill all cores)"),
+    argument("--threads", type=COUNT, metavar="N", help="threads of each point (default: cores over jobs)"),
+    argument(
+        "--walltime", type=seconds, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job",
+    ),
+    argument(
+        "--scheduler", metavar="ADDRESS",
+        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here",
+    ),
+    argument("--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"),
+    argument("--collect", action="store_true", help="run nothing, and write table and figure of existing results"),
+    argument(
+        "--point", type=number(int, 0, inf, "the number of a point, from 0 on"), metavar="K",
+        help="run point K of an existing sweep, counted from 0",
+    ),
+    TRUST, overrides=[], writes=True,
 )  # fmt: skip
 def _sweep(options: argparse.Namespace) -> int:
     from contextlib import ExitStack

@@ -4,22 +4,21 @@ import argparse
 import json
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import add_engine, add_scene, command, read_scene
+from rigidmd.commands.arguments import SCENE, add_engine, argument, command, read_scene
 from rigidmd.engines.registry import runnable
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    add_scene(parser)
+def _engine(parser: argparse.ArgumentParser) -> None:
     first, *_ = runnable()
     precise = [f"; {name} with {key} {value}" for name, of in runnable().items() for key, value in of.precise.items()]
     add_engine(parser, f"the scene's, or {first}{''.join(precise)}", itself=False)
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 @command(
     90, "compute a scene on two engines and compare energies by term, forces, virial, and a short run; exit code 0 if "
     "they agree, else 1",
-    "rigidmd verify water_pme.toml --engine lammps --ranks 2", _arguments,
+    "rigidmd verify water_pme.toml --engine lammps --ranks 2",
+    *SCENE, _engine, argument("--json", action="store_true", help="print JSON"),
 )  # fmt: skip
 def _verify(options: argparse.Namespace) -> int:
     from rigidmd.scene import MolecularScene

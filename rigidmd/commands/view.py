@@ -3,13 +3,13 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import add_run_folder, command, file_about_run, print_page
+from rigidmd.commands.arguments import command, file_about_run, print_page, run_folder
 
 
 @command(
     138, "write one page about a run: means with errors, plots, margins, files, how to repeat it",
     "rigidmd report runs/water",
-    lambda parser: add_run_folder(parser, "page (default: report.html in the folder of the run)"),
+    *run_folder("page (default: report.html in the folder of the run)"), scene="this run", writes=True,
 )  # fmt: skip
 def _report(options: argparse.Namespace) -> int:
     from rigidmd.view.run_page import REPORT, write_report
@@ -21,7 +21,7 @@ def _report(options: argparse.Namespace) -> int:
 @command(
     140, "write one page with the film of a run, which opens in any browser without a network",
     "rigidmd view runs/water -o water.html",
-    lambda parser: add_run_folder(parser, "page (default: view.html in the folder of the run)"),
+    *run_folder("page (default: view.html in the folder of the run)"), scene="this run", writes=True,
 )  # fmt: skip
 def _view(options: argparse.Namespace) -> int:
     from rigidmd.view.animation_page import VIEW, write_view
