@@ -1,7 +1,6 @@
 """Frames for analyses, from the folder of a run or from results in memory; and where production begins."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,11 +11,9 @@ from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.log import TENSOR_FILE, read_tensor
 from rigidmd.io.trajectory import Frames, read_frames
-from rigidmd.run.record import Record
+from rigidmd.run.record import Record, read_record
+from rigidmd.run.results import Results
 from rigidmd.scene.stage import Stage
-
-if TYPE_CHECKING:
-    from rigidmd.run.results import Results
 
 #: Most numbers of 8 bytes of frames in memory; a longer trajectory is thinned out.
 MOST_NUMBERS = 150_000_000
@@ -50,10 +47,8 @@ def frames_of_folder(
         raise OutputError(f"{path}: {error}") from None
 
 
-def frames_of_results(results: "Results", start: float | None = None) -> RigidFrames:
+def frames_of_results(results: Results, start: float | None = None) -> RigidFrames:
     """The frames of a run of molecules in this process. Raises OutputError."""
-    from rigidmd.run.record import read_record
-
     system = results.system
     if not isinstance(system, System):
         raise OutputError("this is a run of a single body, and analyses are for molecules")

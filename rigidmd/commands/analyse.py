@@ -1,15 +1,10 @@
 """`rigidmd analyse`."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rigidmd.commands.arguments import argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
-
-if TYPE_CHECKING:
-    from rigidmd.analysis.files import AnalysisRequest
 
 
 class _List(argparse.Action):
@@ -48,14 +43,24 @@ def _analyse(options: argparse.Namespace) -> int:
     from rigidmd.analysis.files import AnalysisRequest, analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.studies.sweep.folder import is_sweep
+    from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
 
     for path in options.trust:
         run_user_file(Path(path))
     with progress_bar() as progress:
         request = AnalysisRequest(options.only, options.start, options.viscosity)
-        if is_sweep(Path(options.folder)):
-            return _analyse_sweep(Path(options.folder), request, progress)
-        done = analyse_folder(Path(options.folder), request, progress)
+        folder = Path(options.folder)
+        if is_sweep(folder):
+            found = analyse_sweep(folder, request, progress)
+            progress(1.0, "")
+            for of in found:
+                runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
+                print(f"{of.title or folder}: {runs}, {len(of.files)} files in {of.files[0].parent}")
+                _print_results(of.results, of.failed)
+                print()
+            print(f"values of all in {folder / ANALYSES}")
+            return 0
+        done = analyse_folder(folder, request, progress)
     used = done.frames_used
     print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")
     for note in used["notes"]:
@@ -70,17 +75,3 @@ def _print_results(results: list, skipped: dict[str, str]) -> None:
         print(result)
     for name, why in skipped.items():
         print(f"{name}: skipped: {why}")
-
-
-def _analyse_sweep(folder: Path, request: "AnalysisRequest", progress: Callable[[float, str], object]) -> int:
-    from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
-
-    found = analyse_sweep(folder, request, progress)
-    progress(1.0, "")
-    for combination in found:
-        runs = f"{combination.runs} run{'s' if combination.runs > 1 else ''}"
-        print(f"{combination.title or folder}: {runs}, {len(combination.files)} files in {combination.files[0].parent}")
-        _print_results(combination.results, combination.failed)
-        print()
-    print(f"values of all in {folder / ANALYSES}")
-    return 0

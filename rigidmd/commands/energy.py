@@ -2,12 +2,9 @@
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rigidmd.commands.arguments import SCENE, argument, command, read_scene
-
-if TYPE_CHECKING:
-    from rigidmd.scene import BodyScene
 
 
 @command(
@@ -64,7 +61,7 @@ def _print_accuracy(error: dict[str, Any], unit: str) -> None:
     _print_value("error of the energy", error["energy_error"], unit, ">22.4g")
 
 
-def _body_energy(scene: "BodyScene", options: argparse.Namespace) -> int:
+def _body_energy(scene, options: argparse.Namespace) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.run import Simulation
 

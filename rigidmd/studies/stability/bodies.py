@@ -80,10 +80,10 @@ def compare_with_dop853(result: CaseResult, quick: bool, settings: list[tuple[st
             result.add(setting, outcome, ALLOWED.get(family, EXACTLY) + rounding, family, x, STEP, expected)
 
 
-def find_step_limits(result: CaseResult, quick: bool, setting: str, inertia, omega=OMEGA) -> None:
+def find_step_limits(result: CaseResult, quick: bool, setting: str, inertia) -> None:
     """The longest step of each family that keeps a free body's invariants within the bound."""
     for family in families(quick):
-        data = free(inertia, omega)
+        data = free(inertia)
         run = lambda step, data=data, family=family: run_body(data, step, 100 * step, family, conserved_error)  # noqa: E731
         result.limits.append(longest_step(run, STEP, setting, family))
 

@@ -51,9 +51,9 @@ WATER_FORCES = {"cutoff_A": 6.0}
 RIGHT_OR_REFUSED = (RIGHT, REFUSED)
 
 
-def pair_of(distance: float, speed: float, thickness: float = 0.5) -> tuple[list[dict], State]:
+def pair_of(distance: float, speed: float) -> tuple[list[dict], State]:
     """Two bent molecules at a distance (Å) that approach each other at a speed (Å/ps)."""
-    species = [bent(thickness) | {"count": 2}]
+    species = [bent() | {"count": 2}]
     data = molecules_scene(species, BOX, 1.0, 1, temperature=0.0, forces=FORCES)
     state = build(MolecularScene.from_dict(data)).state
     state.position[:] = [[10 - distance / 2, 10, 10], [10 + distance / 2, 10.1, 10]]

@@ -36,7 +36,7 @@ class Combination(NamedTuple):
 
 
 def analyse_sweep(
-    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object] = lambda fraction, name: None
+    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object]
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder
 from rigidmd.run.checkpoints import checked_walltime
+from rigidmd.run.provenance import NOT_COMPARED, keys_of, plain
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.base import default_name, read_tables
@@ -92,8 +94,6 @@ def open_sweep(
 
     Raises SceneError, OutputError.
     """
-    from rigidmd.assemble.user_code.trust import trust as trust_file
-
     for path in trust:
         trust_file(path)
     data, _ = read_tables(scene)
@@ -385,7 +385,5 @@ def code_kind(scene: Scene) -> str:
                 return {key: bare(inner) for key, inner in sorted(value.items())}
             case _:
                 return [bare(inner) for inner in value]
-
-    from rigidmd.run.provenance import NOT_COMPARED, keys_of, plain
 
     return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))))
