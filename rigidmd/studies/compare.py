@@ -4,7 +4,7 @@ import filecmp
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,8 @@ STEP, TIMES = "Step", ("Time (ps)", "t")
 BITS = 53
 
 
-class CellDifference(NamedTuple):
+@dataclass
+class CellDifference:
     column: str
     first: str
     second: str
@@ -70,10 +71,7 @@ class RunComparison:
         return same_samples and not self.state and all(self.files.values()) and not self.missing
 
     def to_json(self) -> dict[str, Any]:
-        samples = self.samples and asdict(self.samples) | {
-            key: [cell._asdict() for cell in getattr(self.samples, key)] for key in ("first", "last")
-        }
-        return asdict(self) | {"same": self.same, "samples": samples}
+        return asdict(self) | {"same": self.same}
 
 
 def compare(first: Path, second: Path) -> RunComparison:
