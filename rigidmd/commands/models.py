@@ -31,7 +31,7 @@ from rigidmd.commands.streams import warn
 def _models(options: argparse.Namespace) -> int:
     from rigidmd.errors import MoleculeError
     from rigidmd.scene.models import available_models, load_model, read_molecule
-    from rigidmd.view.molecule_text import models_table, molecule_text
+    from rigidmd.view.molecule_figure import models_table, molecule_text
 
     if options.geometry is not None:
         return _write_model(options)
@@ -61,7 +61,7 @@ def _write_model(options: argparse.Namespace) -> int:
     """`models --from`."""
     from rigidmd.assemble.model_from_geometry import model_from_geometry
     from rigidmd.errors import MoleculeError
-    from rigidmd.io.model_file import write_model
+    from rigidmd.io.scene_file import write_model
     from rigidmd.io.write import check_target
 
     if options.model is not None:

@@ -24,7 +24,7 @@ def _report(options: argparse.Namespace) -> int:
     *run_folder("page (default: view.html in the folder of the run)"), scene="this run", writes=True,
 )  # fmt: skip
 def _view(options: argparse.Namespace) -> int:
-    from rigidmd.view.animation_page import VIEW, write_view
+    from rigidmd.view.run_page import VIEW, write_view
 
     print_page(*write_view(Path(options.folder), file_about_run(options, VIEW, (".html",))))
     return 0

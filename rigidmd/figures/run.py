@@ -51,12 +51,9 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     for name, color in (("potential", COOL), ("kinetic", WARM)):
         _draw(parts, time, (column[name] - column[name][-1]) / n, stage, color, name)
     parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
-    for name, color, label in (
-        ("temperature_translation", COOL, "translation"),
-        ("temperature_rotation", WARM, "rotation"),
-    ):
-        if np.isfinite(column[name]).all():
-            _draw(temperature, time, column[name], stage, color, label)
+    for label, color in (("translation", COOL), ("rotation", WARM)):
+        if np.isfinite(values := column[f"temperature_{label}"]).all():
+            _draw(temperature, time, values, stage, color, label)
     temperature.set_ylabel("temperature (K)")
     temperature.set_xlabel("time (ps)")
     starts = [float(time[stage == k][0]) for k in np.unique(stage)]

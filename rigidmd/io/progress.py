@@ -37,14 +37,12 @@ class DisplayArea:
         else:
             self._handle.update(bundle, raw=True, metadata=metadata)
 
-    def show_text(self, sentence: str) -> None:
-        self.show({"text/html": f'<small style="opacity:.7">{html.escape(sentence)}</small>', "text/plain": sentence})
-
 
 def announce(sentence: str, spot: DisplayArea) -> None:
     """Announce an operation that takes a moment: in a notebook in this area, else as a line on standard error."""
     if in_notebook():
-        spot.show_text(f"{sentence} ...")
+        faint = f'<small style="opacity:.7">{html.escape(sentence)} ...</small>'
+        spot.show({"text/html": faint, "text/plain": f"{sentence} ..."})
     else:
         print(f"  {sentence} ...", file=sys.stderr, flush=True)
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from rigidmd.core.files import unreadable_reason
+from rigidmd.core.files import unreadable_reason, writing
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError
 from rigidmd.scene.validation import Flag, Number, validation_messages
@@ -18,6 +18,7 @@ from rigidmd.scene.validation import Flag, Number, validation_messages
 LARGEST_JSON, LARGEST_TABLE, LONGEST_LINE, LARGEST_NUMBER = 5e7, 4e9, 100_000, 1e100
 
 T = TypeVar("T")
+adapter_of = lru_cache(TypeAdapter)
 Bounded = Annotated[Number, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 
 
@@ -73,7 +74,9 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
     if not _is_there(path, LARGEST_JSON):
         return None
     try:
-        return _adapter(kind).validate_json(path.read_bytes())
+        with writing(path, "read"):
+            content = path.read_bytes()
+        return adapter_of(kind).validate_json(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
@@ -81,13 +84,6 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
         message = f"is {shorten_repr(first['input'])}, must be a table"
         message = validation_messages(error, BaseModel)[0] if first["loc"] else message
         raise OutputError(f"{path}: {message}{remedy}") from None
-    except OSError as error:
-        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
-
-
-@lru_cache
-def _adapter(kind: Any) -> TypeAdapter:
-    return TypeAdapter(kind)
 
 
 def _is_there(path: Path, largest: float) -> bool:
@@ -123,12 +119,10 @@ def read_columns(path: Path) -> Columns | None:
     if not _is_there(path, LARGEST_TABLE):
         return None
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with writing(path, "read"), path.open(encoding="utf-8", newline="") as file:
             rows = csv.reader(_lines(file))
             head = next(rows, [])
             lines = [line for line in rows if len(line) == len(head)]
-    except OSError as error:
-        raise OutputError(f"{path} cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise OutputError(f"{path} cannot be read: {error}") from None
     return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(head)})

@@ -1,5 +1,6 @@
-"""The scene in the folder of a run, with all defaults and copies of its input files, so that it can be run again."""
+"""Writers of TOML: the scene of a run with all defaults and copies of its input files, and a molecular model."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -11,6 +12,7 @@ from rigidmd.core.files import atomic_file, write_text
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import STRUCTURE
 from rigidmd.scene import Scene
+from rigidmd.scene.models import LENNARD_JONES, MoleculeFile, Site
 
 
 def input_names(scene: Scene) -> dict[str, str]:
@@ -21,6 +23,7 @@ def input_names(scene: Scene) -> dict[str, str]:
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
+    """Write the scene into the folder of a run, so that it can be run again."""
     data = scene.model_dump(exclude_none=True)
     for key, copied in input_names(scene).items():
         with atomic_file(folder / copied) as temporary:
@@ -34,3 +37,41 @@ def write_scene(folder: Path, scene: Scene) -> None:
             section = section[int(part) if isinstance(section, list | tuple) else part]
         section[last] = copied
     write_text(folder / SCENE, tomli_w.dumps(data))
+
+
+#: Head of a file whose sites have no interactions.
+TO_FILL_IN = """# Sites have masses only and do not interact. Add the parameters of each site:
+#   charge_e = -0.1            charge in elementary charges
+#   sigma_A = 3.5              Lennard-Jones diameter
+#   epsilon_kJ_mol = 0.3       well depth, or epsilon_kcal_mol or epsilon_K
+# and the source of the numbers in `source`.
+"""
+
+
+def write_model(path: Path, model: MoleculeFile) -> None:
+    """Write a model, which is read back to the same bits. Raises OutputError."""
+    idle = all(site.charge_e is None and site.sigma_A is None and not site.parameters for site in model.sites)
+    head = [f"{key} = {_text(value)}" for key in ("name", "title", "source", "note") if (value := getattr(model, key))]
+    if model.residue_names:
+        head.append(f"residue_names = [{', '.join(map(_text, model.residue_names))}]")
+    lines = [*([TO_FILL_IN] if idle else []), *head, *(f"\n{_site(site)}" for site in model.sites), ""]
+    write_text(path, "\n".join(lines))
+
+
+def _site(site: Site) -> str:
+    lines = ["[[sites]]", f"name = {_text(site.name)}"]
+    if site.element != "X":
+        lines.append(f"element = {_text(site.element)}")
+    for key in ("mass_u", "position_A", "charge_e", *LENNARD_JONES):
+        value = getattr(site, key)
+        if value is not None:
+            text = f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
+            lines.append(f"{key} = {text}")
+    if site.parameters:
+        items = ", ".join(f"{_text(name)} = {value!r}" for name, value in site.parameters.items())
+        lines.append(f"parameters = {{ {items} }}")
+    return "\n".join(lines)
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False)

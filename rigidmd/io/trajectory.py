@@ -6,7 +6,7 @@ import re
 import struct
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,11 +101,15 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
             read_in_process(form.check, path, 0, sites)
         except StructureError as error:
             raise OutputError(str(error)) from None
-    with _quiet():
+    with ignore_warnings():
+        # a reader that could not open its file complains when it is deleted
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
         try:
             return _frames(path, sites, most)
         except (OSError, EOFError, ValueError, TypeError, IndexError, StopIteration) as error:
             reason = " ".join(str(error).split())
+        finally:
+            sys.unraisablehook = hook
     raise OutputError(f"{path} cannot be read as a trajectory: {reason}")
 
 
@@ -175,17 +179,6 @@ def read_exactly(path: Path) -> list[Frame]:
         raise OutputError(f"{path} cannot be read: {error}") from None
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the warnings of readers, also of one that could not open its file, when it is deleted."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    try:
-        with ignore_warnings():
-            yield
-    finally:
-        sys.unraisablehook = hook
-
-
 def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (p, 2) of points (k, 3) closer than `distance`, in a cell (3, 3) or without a box, and the vectors (p, 3)
     from the first to the second; Å, single precision."""
@@ -196,10 +189,9 @@ def near_pairs(at: np.ndarray, cell: np.ndarray | None, distance: float) -> tupl
 
 
 class SiteReader(ReaderBase):
-    """MDAnalysis' reader of a format with a reader of rigidmd: `open_file`."""
+    """MDAnalysis' reader of the formats with a reader of rigidmd."""
 
     units = {"time": "ps", "length": "Angstrom", "velocity": "Angstrom/ps"}  # noqa: RUF012  (MDAnalysis has it so)
-    open_file: Callable[[Path], Any]
 
     def __init__(self, filename, **options):
         super().__init__(filename, **options)
@@ -213,7 +205,8 @@ class SiteReader(ReaderBase):
 
     def _reopen(self):
         self.close()
-        self._file = self.open_file(Path(str(self.filename)))
+        path = Path(str(self.filename))
+        self._file = not_none(BY_EXTENSION[path.suffix].reader)(path)
         self.n_atoms, self._frame = self._file.sites, -1
 
     def close(self):
@@ -264,24 +257,17 @@ class _WithTimes(ProtoReader):
         return self._set_time(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
-@functools.cache
 def reader_of(extension: str) -> Any:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
-    if form.reader is None:
-        return get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
-    return _named(f"SiteReader_{extension[1:]}", SiteReader, open_file=staticmethod(form.reader))
+    return SiteReader if form.reader else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
 
 
 @functools.cache
 def timed(reader: Any) -> Any:
-    """A subclass of a reader with the times of the run."""
-    return _named(f"Timed{reader.__name__}", _WithTimes, reader)
-
-
-def _named(name: str, *bases: Any, **attributes: Any) -> Any:
-    """A class as a name of this module, so that its readers can be pickled."""
-    globals()[name] = type(bases[-1])(name, bases, {"__module__": __name__, **attributes})
+    """A subclass of a reader with the times of the run, as a name of this module, so that it can be pickled."""
+    name = f"Timed{reader.__name__}"
+    globals()[name] = type(reader)(name, (_WithTimes, reader), {"__module__": __name__})
     return globals()[name]
 
 
@@ -291,8 +277,6 @@ def open_trajectory(
 ) -> "TrajectoryFile | FrameFile":  # fmt: skip
     """The trajectory file for the extension of a path. For the arguments see `TrajectoryFile`."""
     if (writer := BY_EXTENSION[path.suffix].writer) is not None:
-        if not isinstance(system, System):
-            raise TypeError(f"{path.suffix} files are for molecules only")
         return writer(path, system, velocities, wrapped, kept)
     return TrajectoryFile(path, system, interval, velocities, wrapped, kept)
 
@@ -300,7 +284,6 @@ def open_trajectory(
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
     """Write names, molecules and first positions, which viewers need next to a trajectory. Raises SimulationError if
     the format cannot hold a position."""
-
     _check_fits(path, system.site_positions(state, wrapped))
     with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
         write = not_none(BY_EXTENSION[path.suffix].write_topology)

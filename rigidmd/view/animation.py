@@ -14,7 +14,7 @@ from rigidmd.errors import OutputError
 from rigidmd.figures.style import INK, WARM, new_figure
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
-from rigidmd.view.animation_page import animation_of
+from rigidmd.view.run_page import animation_of
 
 EXTENSIONS = (".mp4", ".gif")
 #: Frames per second, length in seconds, and height in pixels of an animation; inches of its picture.

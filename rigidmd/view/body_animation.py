@@ -53,8 +53,13 @@ class BodyAnimation:
         self.notes = [f"{len(rows)} of {count} samples are shown: every {stride}th."] if stride > 1 else []
         mesh = mesh_of(system)
         self.notes.append(f"The body is drawn as {mesh.about}.")
-        position = np.stack([seen[key][rows] for key in "xyz"], -1) if system.translates else np.zeros((len(rows), 3))
+
+        def of(*names: str) -> np.ndarray:
+            return np.stack([seen[name][rows] for name in names], axis=-1)
+
+        position = of("x", "y", "z") if system.translates else np.zeros((len(rows), 3))
         turns = system.rotates and "qw" in seen
+        self.axis = drawn_axis(system)
         middle = (position.max(0) + position.min(0)) / 2
         extent = float(np.linalg.norm(position - middle, axis=1).max())
         moves = extent > FIXED_FRACTION * (mesh.reach if turns else 0.0)
@@ -68,29 +73,29 @@ class BodyAnimation:
                 self.notes.append(f"The body is drawn {enlarged:.3g} times as large as it is relative to its path.")
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)
-            path = radius / self.unit * _lab_axis(record)[rows]
+            path = (
+                radius
+                / self.unit
+                * np.stack([sum(of(f"q{i}{j + 1}")[:, 0] * self.axis[j] for j in range(3)) for i in (1, 2, 3)], axis=-1)
+            )
         self.sphere = 0.0 if moves else radius / self.unit
-        still = np.tile([1.0, 0, 0, 0], (len(rows), 1))
-        self.quaternion = np.stack([seen[key][rows] for key in ("qw", "qx", "qy", "qz")], -1) if turns else still
+        self.quaternion = of("qw", "qx", "qy", "qz") if turns else np.tile([1.0, 0, 0, 0], (len(rows), 1))
         shown = thin_path(path, MOST_POINTS)
         self.path, self.when = path[shown], self.time[shown]
         self.vectors, self.largest = {}, {}
         for name, (key, size, *_) in VECTORS.items():
             if turns and f"{key}_x" in seen:
-                found = np.stack([seen[f"{key}_{k}"][rows] for k in "xyz"], axis=-1)
+                found = of(f"{key}_x", f"{key}_y", f"{key}_z")
                 longest = float(np.linalg.norm(found, axis=1).max())
                 if longest > 0:
                     scale = VECTOR_LENGTH[not moves] * (self.sphere or 1.0) / longest
                     self.vectors[name], self.largest[name] = scale * found, f"{longest:.4g} {size}"
         gravity = np.array(system.scene.gravity.acceleration_m_s2 if system.scene.gravity else np.zeros(3), float)
         self.gravity = GRAVITY_LENGTH[not moves] * gravity / np.linalg.norm(gravity) if gravity.any() else None
-        self.angles = np.empty(0)
-        if turns:
-            self.angles = np.degrees(np.stack([seen[key][rows] for key in ("phi", "theta", "psi")], -1))
+        self.angles = np.degrees(of("phi", "theta", "psi")) if turns else np.empty(0)
         self.azimuth = float(np.arctan2(path[0, 1], path[0, 0])) - 0.6 if np.hypot(*path[0, :2]) > 1e-9 else 0.6
         self.mesh = mesh._replace(vertices=mesh.vertices * enlarged / self.unit)
-        self.centre, self.axis = system.centre * enlarged / self.unit, drawn_axis(system)
-        self.pinned = not system.translates
+        self.centre, self.pinned = system.centre * enlarged / self.unit, not system.translates
         level = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
         self._view = camera(np.cos(LIFT) * level + np.sin(LIFT) * UP, UP)
         self._rings = self.sphere * np.concatenate([np.vstack([ring, np.full(3, np.nan)]) for ring in globe()])
@@ -231,9 +236,3 @@ class BodyAnimation:
 
 def _short(values: np.ndarray) -> np.ndarray:
     return values.astype("<f4")
-
-
-def _lab_axis(record: Record) -> np.ndarray:
-    """The body axis whose path is drawn, in the lab (t, 3)."""
-    axis = drawn_axis(record.body)
-    return np.stack([sum(record.columns[f"q{i}{j + 1}"] * axis[j] for j in range(3)) for i in (1, 2, 3)], axis=-1)

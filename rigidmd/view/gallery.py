@@ -6,18 +6,16 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.run import Simulation
-from rigidmd.run.record import Record, read_record
+from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
-from rigidmd.view.animation_page import write_view
 from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.page import code, page
+from rigidmd.view.run_page import write_view
 
 INDEX = "index.html"
 #: The default bodies.
@@ -53,8 +51,14 @@ def write_gallery(
         run = folder / "runs" / example.name
         Simulation(scene, run, force).run()
         target, _ = write_view(run, folder / f"{example.name}.html")
+        animation, stream = BodyAnimation(read_record(run)), io.BytesIO()
+        figure = new_figure(INCHES, INCHES, layout=None, dpi=DPI)
+        begin, end = animation.time[[0, -1]]
+        animation.draw(figure.add_axes((0, 0, 1, 1)), float(begin + RUN_FRACTION * (end - begin)))
+        save_figure(figure, stream, format="png", dpi=DPI)
+        picture = base64.b64encode(stream.getvalue()).decode()
         cards.append(
-            f'<a href="{target.name}"><img alt="" src="data:image/png;base64,{_picture(read_record(run))}">'
+            f'<a href="{target.name}"><img alt="" src="data:image/png;base64,{picture}">'
             f"<b>{html.escape(example.name)}</b><span>{html.escape(example.about)}</span></a>"
         )
     parts = [
@@ -64,12 +68,3 @@ def write_gallery(
     ]
     write_text(folder / INDEX, page("Tops, gyroscopes and a stone", parts, STYLE))
     return folder / INDEX
-
-
-def _picture(record: Record) -> str:
-    animation = BodyAnimation(record)
-    figure = new_figure(INCHES, INCHES, layout=None, dpi=DPI)
-    animation.draw(figure.add_axes((0, 0, 1, 1)), float(np.interp(RUN_FRACTION, [0, 1], animation.time[[0, -1]])))
-    stream = io.BytesIO()
-    save_figure(figure, stream, format="png", dpi=DPI)
-    return base64.b64encode(stream.getvalue()).decode()

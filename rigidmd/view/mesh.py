@@ -1,6 +1,5 @@
 """The surface of a single body for drawings: its solid, its points joined by rods, or a solid of the same inertia."""
 
-from functools import partial
 from itertools import pairwise, product
 from typing import NamedTuple
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from rigidmd.assemble.body_parts import inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
+from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.solids import SOLIDS
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
@@ -45,8 +45,7 @@ def mesh_of(system: BodySystem) -> Mesh:
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
     if wanted is None and table.points is not None:
-        positions = np.array([p.position_m for p in table.points])
-        masses = np.array([p.mass_kg for p in table.points])
+        positions, masses = (np.array([getattr(p, key) for p in table.points]) for key in ("position_m", "mass_kg"))
         return _points_mesh(positions if table.pinned else positions - masses @ positions / mass, masses)
     if isinstance(wanted, Solid):
         stands = wanted.shape == "cone" and table.pinned
@@ -60,26 +59,24 @@ def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
     size = np.zeros(3)
     for name, axes in SOLIDS[solid.shape].dimensions.items():
         size[axes] = solid.dimensions[name]
-    size = np.maximum(size, MIN_THICKNESS * size.max())
-    unit = UNITS.get(solid.shape, _ball)()
-    article = "an" if solid.shape[0] in "aeiou" else "a"
-    return Mesh(unit.vertices * size + position, unit.faces, unit.painted, f"{article} {solid.shape}")
+    unit = UNITS.get(solid.shape, BALL)
+    about = f"{'an' if solid.shape[0] in 'aeiou' else 'a'} {solid.shape}"
+    return unit._replace(vertices=unit.vertices * np.maximum(size, MIN_THICKNESS * size.max()) + position, about=about)
 
 
 def _equal_inertia_mesh(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
     """A homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid."""
     if not tensor.any():
-        unit = _ball()
-        return Mesh(unit.vertices, unit.faces, unit.painted, "a ball, as it is a point")
+        return BALL._replace(about="a ball, as it is a point")
     moments, axes = principal(tensor)
     symmetric = axis_of_symmetry(moments)
     if wanted in (None, "top") and symmetric is not None:
         return _top_mesh(mass, moments, axes, symmetric, centre, pinned)
     lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
-    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), _ball(), "ellipsoid"
+    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
     if wanted != "ellipsoid":
-        lengths, unit, shape = CUBOID_EDGES * lengths, _cuboid(), "cuboid"
-    return Mesh((unit.vertices * lengths) @ axes.T + centre, unit.faces, unit.painted, f"the {shape} {EQUAL}")
+        lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
+    return unit._replace(vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}")
 
 
 def _top_mesh(
@@ -115,86 +112,61 @@ def _top_mesh(
         about += ", on a stem"
     unit = _revolve(rings)
     frame = np.stack([right, np.cross(axis, right), axis])
-    return Mesh(unit.vertices @ frame + centre, unit.faces, unit.painted, about, stem)
+    return unit._replace(vertices=unit.vertices @ frame + centre, about=about, stem=stem)
 
 
 def _points_mesh(positions: np.ndarray, masses: np.ndarray) -> Mesh:
     """Balls at the points, with sizes by their masses, and rods between nearest points."""
-    from scipy.sparse.csgraph import minimum_spanning_tree
-    from scipy.spatial.distance import cdist
+    from scipy.spatial.distance import pdist
 
-    far = cdist(positions, positions)
-    size = max(far.max(), np.linalg.norm(positions, axis=1).max())
+    size = max(pdist(positions).max(initial=0.0), np.linalg.norm(positions, axis=1).max())
     parts = []
     for position, mass in zip(positions, masses, strict=True):
-        unit = _ball()
         radius = 0.09 * size * (mass / masses.max()) ** (1 / 3) if size > 0 else 1.0
-        parts.append((unit.vertices * max(radius, 0.02 * size) + position, unit))
-    tree = minimum_spanning_tree(far).tocoo()
-    for i, j in zip(tree.row, tree.col, strict=True):
-        unit, along = _cylinder(), positions[j] - positions[i]
+        parts.append(BALL._replace(vertices=BALL.vertices * max(radius, 0.02 * size) + position))
+    for i, j in shortest_links(positions):
+        along = positions[j] - positions[i]
         right = unit_vector(np.cross(along, np.eye(3)[np.abs(along).argmin()]))
         frame = np.stack([0.02 * size * right, 0.02 * size * unit_vector(np.cross(along, right)), along])
-        parts.append((unit.vertices @ frame + (positions[i] + positions[j]) / 2, unit._replace(painted=[False] * 99)))
+        vertices = CYLINDER.vertices @ frame + (positions[i] + positions[j]) / 2
+        parts.append(CYLINDER._replace(vertices=vertices, painted=[False] * len(CYLINDER.faces)))
     faces, painted, start = [], [], 0
-    for vertices, unit in parts:
-        faces += [[start + corner for corner in face] for face in unit.faces]
-        painted += unit.painted[: len(unit.faces)]
-        start += len(vertices)
-    return Mesh(np.concatenate([vertices for vertices, _ in parts]), faces, painted, "its points, joined")
+    for part in parts:
+        faces += [[start + corner for corner in face] for face in part.faces]
+        painted += part.painted
+        start += len(part.vertices)
+    return Mesh(np.concatenate([part.vertices for part in parts]), faces, painted, "its points, joined")
 
 
-def _revolve(rings: list[tuple[float, float]]) -> Mesh:
-    """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its side is painted."""
-    angle = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
+def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:
+    """A solid of revolution about axis 3 from circles (radius, z), from below; a quarter of its side is painted. A
+    `closed` one is a ring, without discs at its ends."""
+    n, corner = CIRCLE_CORNERS, np.arange(CIRCLE_CORNERS)
+    angle = 2 * np.pi * corner / n
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    vertices = np.concatenate([np.column_stack([r * circle, np.full(CIRCLE_CORNERS, z)]) for r, z in rings])
-    faces, painted = [], []
-    for k in range(len(rings) - 1):
-        for i in range(CIRCLE_CORNERS):
-            j = (i + 1) % CIRCLE_CORNERS
-            faces.append(
-                [
-                    k * CIRCLE_CORNERS + i,
-                    k * CIRCLE_CORNERS + j,
-                    (k + 1) * CIRCLE_CORNERS + j,
-                    (k + 1) * CIRCLE_CORNERS + i,
-                ]
-            )
-            painted.append(i < CIRCLE_CORNERS // 4)
+    vertices = np.concatenate([np.column_stack([r * circle, np.full(n, z)]) for r, z in rings])
+    below = n * np.arange(len(rings) - 1)[:, None]  # the first corner of each strip between two circles
+    i, j = below + corner, below + (corner + 1) % n
+    faces = np.stack([i, j, j + n, i + n], axis=-1).reshape(-1, 4).tolist()
+    painted = (corner < n // 4).tolist() * (len(rings) - 1)
     for k, order in ((0, -1), (len(rings) - 1, 1)):
-        if rings[k][0] > 0:
-            ends = list(range(k * CIRCLE_CORNERS, (k + 1) * CIRCLE_CORNERS))
-            wedge = ends[: CIRCLE_CORNERS // 4 + 1]
-            middle = len(vertices)
+        if rings[k][0] > 0 and not closed:
+            ends, middle = list(range(k * n, (k + 1) * n)), len(vertices)
             vertices = np.vstack([vertices, [0.0, 0.0, rings[k][1]]])
-            faces += [[middle, *wedge][::order], [middle, *ends[CIRCLE_CORNERS // 4 :], ends[0]][::order]]
+            faces += [[middle, *ends[: n // 4 + 1]][::order], [middle, *ends[n // 4 :], ends[0]][::order]]
             painted += [True, False]
     return Mesh(vertices, faces, painted, "")
 
 
-def _ball() -> Mesh:
-    polar = np.linspace(np.pi, 0, 13)
-    return _revolve([(np.sin(a), np.cos(a)) for a in polar])
-
-
-_cylinder, _rod = partial(_revolve, [(1.0, -0.5), (1.0, 0.5)]), partial(_revolve, [(0.5, -0.5), (0.5, 0.5)])
-_cone = partial(_revolve, [(0.0, -0.75), (1.0, 0.25)])
-
-
-def _ring() -> Mesh:
-    """A ring of unit radius about axis 3, as a tube, whose thickness along the axis is MIN_THICKNESS."""
-    angle = np.linspace(0, 2 * np.pi, 9)[:-1]
-    tube = _revolve([(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*angle, angle[0]]])
-    sides = CIRCLE_CORNERS * (len(angle))
-    return Mesh(tube.vertices, tube.faces[:sides], tube.painted[:sides], "")
-
-
-def _cuboid() -> Mesh:
-    vertices = np.array(list(product([-0.5, 0.5], repeat=3)))
-    faces = [[4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1], [1, 5, 7, 3], [0, 2, 6, 4]]
-    return Mesh(vertices, faces, [True] + [False] * 5, "")
-
-
-#: Surfaces of unit size, as `SOLIDS` has them; a sphere and an ellipsoid are balls.
-UNITS = {"cylinder": _cylinder, "disk": _cylinder, "cone": _cone, "rod": _rod, "ring": _ring, "cuboid": _cuboid}
+#: Surfaces of unit size, as `SOLIDS` has them; a sphere and an ellipsoid are balls, and a ring is a thin tube.
+BALL = _revolve([(np.sin(a), np.cos(a)) for a in np.linspace(np.pi, 0, 13)])
+CYLINDER = _revolve([(1.0, -0.5), (1.0, 0.5)])
+CUBOID = Mesh(
+    np.array(list(product([-0.5, 0.5], repeat=3))),
+    [[4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1], [1, 5, 7, 3], [0, 2, 6, 4]], [True] + [False] * 5, "",
+)  # fmt: skip
+UNITS = {
+    "cylinder": CYLINDER, "disk": CYLINDER, "cuboid": CUBOID, "rod": _revolve([(0.5, -0.5), (0.5, 0.5)]),
+    "cone": _revolve([(0.0, -0.75), (1.0, 0.25)]),
+    "ring": _revolve([(1 + 0.06 * np.cos(a), 0.5 * np.sin(a)) for a in [*np.linspace(0, 2 * np.pi, 9)[:8], 0]], True),
+}  # fmt: skip

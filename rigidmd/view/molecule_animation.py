@@ -3,7 +3,6 @@
 import html
 from importlib.resources import files
 from itertools import combinations, product
-from pathlib import Path
 
 import numpy as np
 
@@ -35,10 +34,14 @@ def chemiscope_script() -> str:
 
 
 def frames_of(record: Record, most: int) -> Frames:
-    """Frames of the trajectory of a run of molecules, each molecule whole and inside the box. Raises OutputError."""
+    """Frames of the trajectory of a run of molecules, each molecule whole and inside the box. Raises OutputError if
+    distances within molecules are not as in the molecules of this run."""
     path, sites = record.trajectory, record.molecules.sites
     found = read_frames(path, len(sites.molecule), most)
-    _check_shapes(path, sites, found.positions[0])
+    pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
+    wanted, seen = (np.linalg.norm(at[pairs + 1] - at[pairs], axis=1) for at in (sites.offset_body, found.positions[0]))
+    if np.abs(wanted - seen).max(initial=0.0) > MAX_DEVIATION:
+        raise OutputError(f"{path} is not the trajectory of this run: its molecules have other shapes")
     return inside(found, sites)
 
 
@@ -46,36 +49,17 @@ def inside(frames: Frames, sites: Sites) -> Frames:
     """The frames with the centre of each molecule inside the box; molecules stay whole."""
     if frames.cells is None:
         return frames
-    centre = np.stack([_centres(frame, sites.molecule) for frame in frames.positions])
-    fractions = np.linalg.solve(np.swapaxes(frames.cells, 1, 2), np.swapaxes(centre, 1, 2))  # cells as columns
-    shift = np.swapaxes(np.swapaxes(frames.cells, 1, 2) @ np.floor(fractions), 1, 2)
+    count, columns = np.bincount(sites.molecule), np.swapaxes(frames.cells, 1, 2)
+    centres = np.array([[np.bincount(sites.molecule, x) / count for x in frame.T] for frame in frames.positions])
+    shift = np.swapaxes(columns @ np.floor(np.linalg.solve(columns, centres)), 1, 2)
     return frames._replace(positions=frames.positions - shift[:, sites.molecule].astype(np.float32))
-
-
-def _check_shapes(path: Path, sites: Sites, frame: np.ndarray) -> None:
-    """Raise OutputError if distances within molecules are not as in the molecules of this run."""
-    pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
-    wanted, seen = (np.linalg.norm(at[pairs + 1] - at[pairs], axis=1) for at in (sites.offset_body, frame))
-    if np.abs(wanted - seen).max(initial=0.0) > MAX_DEVIATION:
-        raise OutputError(f"{path} is not the trajectory of this run: its molecules have other shapes")
-
-
-def _centres(frame: np.ndarray, molecule: np.ndarray) -> np.ndarray:
-    count = np.bincount(molecule)
-    return np.stack([np.bincount(molecule, frame[:, k]) / count for k in range(3)], axis=-1)
 
 
 def describe_thinning(frames: Frames) -> list[str]:
     """Notes on the frames of a trajectory that are left out."""
-    notes = []
-    if frames.stride > 1:
-        notes.append(
-            f"{len(frames.time)} of {frames.count} frames are shown, every {frames.stride}th: "
-            "all of them would be too large."
-        )
-    if frames.is_cut:
-        notes.append("The trajectory ends within a frame, which is left out.")
-    return notes
+    shown = f"{len(frames.time)} of {frames.count} frames are shown, every {frames.stride}th"
+    notes = [f"{shown}: all of them would be too large."] if frames.stride > 1 else []
+    return notes + ["The trajectory ends within a frame, which is left out."] * frames.is_cut
 
 
 def massive_bonds(system: System) -> list[list[int]]:
@@ -111,7 +95,14 @@ class MoleculeAnimation:
         radii = [SPHERE_SCALE * COVALENT[e] if e in COVALENT else DEFAULT_RADIUS for e in self._elements]
         self._radius, self._view = np.array(radii), camera(EYE, UP)
         self._color = np.array([to_rgb(COLOURS.get(e, OTHER)) for e in self._elements])
-        self._low, self._high = self._limits()
+        cells, seen = self._frames.cells, self._frames.positions
+        self._corners = None if cells is None else np.array(list(product((0, 1), repeat=3))) @ cells @ self._view.T
+        seen = (seen @ self._view.T if self._corners is None else self._corners).reshape(-1, 3)
+        low, high = seen.min(0), seen.max(0)
+        half = (high - low) / 2
+        half[:2] = half[:2].max()  # the picture is square
+        half = 1.08 * half + 1.0
+        self._low, self._high = (low + high) / 2 - half, (low + high) / 2 + half
 
     def loop_end(self) -> tuple[float, list[str]]:
         """End of a film, and notes."""
@@ -132,50 +123,27 @@ class MoleculeAnimation:
         seen = frames.positions[k, self._shown] @ self._view.T  # right, up, towards the eye
         order = seen[:, 2].argsort()
         near = (seen[order, 2] - self._low[2]) / (self._high[2] - self._low[2])
-        haze = (HAZE * (1 - near.clip(0, 1)))[:, None]
-        color, radius = self._color[order], self._radius[order]
-        discs = []
-        for size, lift, white in DISCS:
-            tint = color * (1 + min(white, 0)) + (1 - color) * max(white, 0)
-            discs.append(
-                (seen[order, :2] + lift * radius[:, None] * LIGHT, 2 * size * radius, tint * (1 - haze) + haze)
-            )
-        positions, widths, colors = (np.stack(part, axis=1) for part in zip(*discs, strict=True))
-        widths = widths.ravel()
+        haze = (HAZE * (1 - near.clip(0, 1)))[:, None, None]
+        color, radius = self._color[order][:, None], self._radius[order][:, None]
+        size, lift, white = np.array(DISCS).T  # of the discs (m, d) of m atoms
+        tint = color * (1 + np.minimum(white, 0))[:, None] + (1 - color) * np.maximum(white, 0)[:, None]
+        widths = (2 * size * radius).ravel()
+        style = {
+            "offsets": (seen[order, None, :2] + (lift * radius)[..., None] * LIGHT).reshape(-1, 2),
+            "facecolors": (tint * (1 - haze) + haze).reshape(-1, 3).clip(0, 1), "edgecolors": "none", "zorder": 2,
+        }  # fmt: skip
         self._box(axes, k, back=True)
-        axes.add_collection(
-            EllipseCollection(
-                widths, widths, 0, units="xy", offsets=positions.reshape(-1, 2), offset_transform=axes.transData,
-                facecolors=colors.reshape(-1, 3).clip(0, 1), edgecolors="none", zorder=2,
-            )
-        )  # fmt: skip
+        axes.add_collection(EllipseCollection(widths, widths, 0, units="xy", offset_transform=axes.transData, **style))
         self._box(axes, k, back=False)
         span = self._high[0] - self._low[0]
         length = next(x for x in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if x < 0.3 * span or x == 1)
         draw_scale(axes, self._high[0] - 0.03 * span, self._low[1] + 0.03 * span, length, f"{length} Å")
 
-    def _corners(self, k: int) -> np.ndarray:
-        cells = self._frames.cells
-        return (
-            np.zeros((0, 3)) if cells is None else np.array(list(product((0, 1), repeat=3))) @ cells[k] @ self._view.T
-        )
-
-    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest coordinates in the picture, which is square, and in depth."""
-        frames = range(len(self._frames.time))
-        positions = [self._corners(k) for k in frames] if self._frames.cells is not None else self._frames.positions
-        positions = np.concatenate([part if part.shape[0] == 8 else part @ self._view.T for part in positions])
-        low, high = positions.min(0), positions.max(0)
-        middle, half = (low + high) / 2, (high - low) / 2
-        half[:2] = half[:2].max()
-        half = 1.08 * half + 1.0
-        return middle - half, middle + half
-
     def _box(self, axes, k: int, back: bool) -> None:
         """The edges of the box at its furthest corner (`back`), or all others."""
-        corners = self._corners(k)
-        if not len(corners):
+        if self._corners is None:
             return
+        corners = self._corners[k]
         furthest = int(corners[:, 2].argmin())
         for i, j in combinations(range(8), 2):
             if (i ^ j) in (1, 2, 4) and (furthest in (i, j)) == back:
@@ -197,10 +165,8 @@ class MoleculeAnimation:
         }  # fmt: skip
         count = np.bincount(molecules.model.species, minlength=len(molecules.species))
         legend = ", ".join(f"{k} {m.name}" for k, m in zip(count, molecules.species, strict=True))
-        usage = (
-            "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes. "
-            "Space plays. A click on a plot jumps to its time. Drawn by chemiscope (chemiscope.org)."
-        )
+        usage = "Drag to rotate, wheel or pinch to zoom; the ☰ of the picture has its style, the box, labels and axes."
+        usage += " Space plays. A click on a plot jumps to its time. Drawn by chemiscope (chemiscope.org)."
         picture = '<div class="molecules" id="film-picture"></div><div hidden id="film-meta"></div>'
         picture += '<div hidden id="film-info"></div>'
         scripts = [code, read_asset("film.js"), read_asset("molecules.js")]

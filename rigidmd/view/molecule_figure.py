@@ -1,16 +1,100 @@
-"""A picture of a model: atoms as spheres, Lennard-Jones diameters, charges, massless sites, principal axes."""
+"""Molecular models as text, a table of all or one in full, and as a picture: atoms as spheres, Lennard-Jones diameters,
+charges, massless sites, principal axes."""
 
+import re
+import textwrap
+from collections import Counter
+from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rigidmd.core.files import atomic_file
 from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_figure, settings
-from rigidmd.io.formats.bonds import COVALENT, bonds
+from rigidmd.io.formats.bonds import COVALENT, bonds, distance
 from rigidmd.io.write import check_target
-from rigidmd.scene.models import Molecule
-from rigidmd.view.molecule_text import short_source
+from rigidmd.scene.models import GROUPS, Molecule
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+WIDTH = 100
+
+
+def models_table(molecules: list[Molecule]) -> str:
+    """A line for each model, by groups, at most WIDTH columns wide."""
+    groups = []
+    for group in GROUPS:
+        lines = [f"{group:<20}sites   mass u dipole D  {'charges e':<22}source"]
+        for m in [m for m in molecules if m.group == group]:
+            dipole = f"{m.dipole_debye:.3f}" if m.charges.any() and m.radius > 0 else ""
+            charges = " ".join(dict.fromkeys(f"{q:+.4g}" for q in m.charges if q))
+            line = f"  {m.name:<19}{len(m.masses):>4}{m.mass:>9.4g}{dipole:>9}  "
+            lines.append(f"{line}{textwrap.shorten(charges, 21, placeholder=' ...'):<22}{short_source(m)}".rstrip())
+        if len(lines) > 1:
+            groups.append("\n".join(lines))
+    return "\n\n".join(groups)
+
+
+def short_source(m: Molecule) -> str:
+    """Authors and year."""
+    found = re.match(r".*?\b(?:19|20)\d\d\b", m.source)
+    authors, year = (found[0][:-4].strip(), found[0][-4:]) if found else (m.source, "")
+    names = re.split(r", | & ", authors)
+    return f"{names[0]} et al. {year}" if len(names) > 2 else f"{authors} {year}"
+
+
+def molecule_text(m: Molecule) -> str:
+    """One model in full: kind, sites in the principal frame, geometry, source."""
+    lines = [f"{m.name}: {m.title}" if m.title else m.name, f"  {m.description}"]
+    lines.append(f"  {m.degrees_of_freedom} degrees of freedom")
+    lines.append(f"  principal moments {' '.join(f'{x:.5g}' for x in m.inertia)} u Å²")
+    if m.kind == "linear" and m.charges.any() and not m.charge:
+        lines.append(f"  quadrupole along the axis {m.quadrupole_debye_A[0, 0]:+.4f} D Å")
+    columns = "  site   element    mass u       x Å       y Å       z Å   charge e   sigma Å  epsilon kJ/mol        K"
+    lines += ["", columns]
+    for i, name in enumerate(m.site_names):
+        x, y, z = np.round(m.positions_body[i], 5) + 0.0
+        charge = f"{m.charges[i]:+.6g}" if m.charges[i] else ""
+        element = m.elements[i] if m.elements[i] != "X" else ""
+        well = ""
+        if m.epsilon[i] > 0:
+            well = f"{m.sigma[i]:>10.6g}{m.epsilon[i] / KJ_PER_MOL:>16.6g}{m.epsilon[i] / BOLTZMANN:>9.5g}"
+        line = f"  {name:<7}{element:<7}{m.masses[i]:>10.4f}{x:>10.5f}{y:>10.5f}{z:>10.5f}{charge:>11}{well}"
+        lines.append(line.rstrip())
+    lines.append("")
+    lengths, angles = _geometry(m)
+    for name, text in (
+        ("lengths", lengths), ("angles", angles), ("mixing", m.mixing), ("note", m.note), ("source", m.source),
+    ):  # fmt: skip
+        if text:
+            lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name:<8}", subsequent_indent=" " * 10)
+    if m.residue_names:
+        lines.append(f"  {'called':<8}{' '.join(m.residue_names)} in structure files")
+    return "\n".join(lines)
+
+
+def _geometry(m: Molecule) -> list[str]:
+    """Lengths and angles of the links; equal ones are counted."""
+    stems = [re.sub(r"(?<=\D)\d+$", "", name) for name in m.site_names]
+    kind = [stem if stems.count(stem) > 1 else name for stem, name in zip(stems, m.site_names, strict=True)]
+    # charges that represent a multipole are left out: the table of sites shows them
+    few = (m.masses == 0).sum() <= 2
+    links = [(i, j) for i, j in bonds(m) if m.masses[j] > 0 or few]
+    lengths = Counter(f"{kind[i]}-{kind[j]} {distance(m, i, j):.4f} Å" for i, j in links)
+    angles = Counter()
+    for one, other in combinations(links, 2):
+        if len(ends := {*one} ^ {*other}) == 2:
+            (corner,) = {*one} & {*other}
+            a, b = sorted(ends, key=lambda s: kind[s])
+            to_a, to_b = distance(m, a, corner), distance(m, b, corner)
+            # an angle between two massless sites on an atom is listed; a site on a bisector is defined by its length
+            ears = kind[a] == kind[b] and abs(to_a / to_b - 1) < 1e-6
+            if ears or m.masses[a] > 0 < m.masses[b]:
+                u, v = (m.positions_body[[a, b]] - m.positions_body[corner]) / [[to_a], [to_b]]
+                angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
+                angles[f"{kind[a]}-{kind[corner]}-{kind[b]} {angle:.2f}°"] += 1
+    return [", ".join(w if n == 1 else f"{w} ({n})" for w, n in found.items()) for found in (lengths, angles)]
+
 
 EXTENSIONS = (".png", ".svg", ".pdf")
 #: Colours of the elements, after Corey, Pauling and Koltun, and of all others.
@@ -27,29 +111,28 @@ AZIMUTH, LIFT = 25.0, 20.0
 INCHES, FONT = 7.0, 9.0
 
 
-class _Sphere(NamedTuple):
-    centre: tuple[float, float]  # Å
-    depth: float  # Å, towards the viewer
-    radius: float  # Å
-
-
 def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     """Draw a molecule into a file, whose extension sets the format. Raises OutputError."""
+    from matplotlib.patches import Circle
+
     check_target(path, EXTENSIONS, force, "figure")
     view = _view(m)
-    seen = m.positions_body @ view.T  # right, up, towards the viewer
-    spheres = [_Sphere((x, y), depth, _radius(m, i)) for i, (x, y, depth) in enumerate(seen.tolist())]
-    reach = [max(s.radius, m.sigma[i] / 2 if m.epsilon[i] > 0 else 0.0) for i, s in enumerate(spheres)]
-    half = 1.12 * max(np.abs(s.centre).max() + r for s, r in zip(spheres, reach, strict=True))
+    seen: Any = m.positions_body @ view.T  # right, up, towards the viewer
+    radius: Any = np.array([_radius(m, i) for i in range(len(m.masses))])
+    reach = np.maximum(radius, np.where(m.epsilon > 0, m.sigma / 2, 0.0))
+    half = float(1.12 * (np.abs(seen[:, :2]).max(axis=1) + reach).max())
     figure = new_figure(INCHES, INCHES * 1.12, layout=None)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
     axes.set_axis_off()
-    _diameters(axes, m, spheres)
-    bonded = _links(axes, m, seen, spheres)
+    for i in np.flatnonzero(m.epsilon > 0).tolist():
+        colour, dashed = _colour(m, i) if m.elements[i] != "H" else OTHER, {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
+        axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
+        axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed))
+    bonded = _links(axes, m, seen, radius)
     for i in np.argsort(seen[:, 2], kind="stable"):
-        _sphere(axes, m, i, spheres[i])
+        _sphere(axes, m, i, seen[i], radius[i])
     taken = _principal_axes(axes, m, view, half)
-    _labels(axes, m, spheres, half, taken + bonded)
+    _labels(axes, m, seen[:, :2], radius, half, taken + bonded)
     length = 1.0 if half > 1.6 else 0.5
     draw_scale(axes, length - 0.96 * half, -0.95 * half, length, f"{length:g} Å", FONT)
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
@@ -89,20 +172,7 @@ def _colour(m: Molecule, i: int) -> str:
     return COLOURS.get(m.elements[i], OTHER)
 
 
-def _diameters(axes, m: Molecule, spheres: list[_Sphere]) -> None:
-    from matplotlib.patches import Circle
-
-    for i in np.flatnonzero(m.epsilon > 0).tolist():
-        colour = _colour(m, i) if m.elements[i] != "H" else OTHER
-        axes.add_patch(Circle(spheres[i].centre, m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
-        axes.add_patch(
-            Circle(
-                spheres[i].centre, m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, lw=0.8, ls=(0, (4, 3)), zorder=1
-            )
-        )
-
-
-def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[tuple]:
+def _links(axes, m: Molecule, seen: np.ndarray, radius: np.ndarray) -> list[tuple]:
     """Draw bonds between the surfaces of spheres. Returns points that labels must not cover."""
     taken = []
     for i, j in bonds(m):
@@ -110,7 +180,7 @@ def _links(axes, m: Molecule, seen: np.ndarray, spheres: list[_Sphere]) -> list[
             axes.plot(*seen[[i, j], :2].T, color=FAINT, lw=1.0, zorder=_order(seen[j, 2]) - 0.01)
             continue
         along = (seen[j] - seen[i]) / np.linalg.norm(seen[j] - seen[i])
-        ends = np.array([seen[i] + 0.9 * spheres[i].radius * along, seen[j] - 0.9 * spheres[j].radius * along])
+        ends = np.array([seen[i] + 0.9 * radius[i] * along, seen[j] - 0.9 * radius[j] * along])
         for colour, width in (("#8f949b", 7.0), ("#c9cdd2", 4.0)):
             axes.plot(*ends[:, :2].T, color=colour, lw=width, solid_capstyle="butt", zorder=_order(ends[:, 2].mean()))
         taken += [(*x, *x) for x in np.linspace(ends[0, :2], ends[1, :2], 12)]
@@ -122,25 +192,20 @@ def _order(depth: float) -> float:
     return 5.0 + np.tanh(depth / 5.0)
 
 
-def _sphere(axes, m: Molecule, i: int, sphere: _Sphere) -> None:
+def _sphere(axes, m: Molecule, i: int, seen: Any, radius: float) -> None:
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Circle, RegularPolygon
 
-    order = _order(sphere.depth)
     if m.masses[i] == 0:
-        style = {"fc": "white", "ec": COOL, "lw": 1.5, "zorder": 6.5}
-        axes.add_patch(RegularPolygon(sphere.centre, 4, radius=sphere.radius, **style))
+        axes.add_patch(RegularPolygon(seen[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5))
         return
-    base, steps = np.array(to_rgb(_colour(m, i))), 24
-    (x, y), towards_light = sphere.centre, (-0.32 * sphere.radius, 0.36 * sphere.radius)
+    base, steps, order = np.array(to_rgb(_colour(m, i))), 24, _order(seen[2])
     for k in range(steps):
         fraction = k / (steps - 1)  # from the dark rim to the light spot
         colour = np.clip(base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1)
-        centre = x + fraction * towards_light[0], y + fraction * towards_light[1]
-        spot = Circle(centre, sphere.radius * (1 - 0.93 * fraction), fc=colour, lw=0)
-        spot.set_zorder(order)
-        axes.add_patch(spot)
-    axes.add_patch(Circle(sphere.centre, sphere.radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
+        x, y = seen[:2] + fraction * np.array([-0.32 * radius, 0.36 * radius])
+        axes.add_patch(Circle((x, y), radius * (1 - 0.93 * fraction), fc=colour, lw=0, zorder=order))
+    axes.add_patch(Circle(seen[:2], radius, fill=False, ec=0.55 * base, lw=0.8, zorder=order))
 
 
 def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tuple]:
@@ -165,41 +230,33 @@ def _principal_axes(axes, m: Molecule, view: np.ndarray, half: float) -> list[tu
     return taken
 
 
-def _labels(axes, m: Molecule, spheres: list[_Sphere], half: float, taken: list[tuple]) -> None:
+def _labels(axes, m: Molecule, centres: np.ndarray, radius: np.ndarray, half: float, taken: list[tuple]) -> None:
     """Draw names and charges in the first free direction, from outward on."""
     height = FONT * 1.25 / 72 * 2 * half / (INCHES * 0.96)
-    for i in sorted(range(len(spheres)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(spheres[i].centre))):
+    for i in sorted(range(len(radius)), key=lambda i: (m.masses[i] > 0, -np.linalg.norm(centres[i]))):
         text = f"{m.site_names[i]} {m.charges[i]:+.5g}" if m.charges[i] else m.site_names[i]
         size = np.array([0.56 * height * len(text), height])
-        x, y = spheres[i].centre
+        x, y = centres[i]
         outward = np.arctan2(y, x) if np.hypot(x, y) > 1e-6 * half else -np.pi / 2
+        boxes = np.array(taken).reshape(-1, 4)  # left, bottom, right, top
         best = None
         for gap in (0.02, 0.08, 0.16, 0.26, 0.38, 0.52):
             for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6, 7, -7, 8):
                 angle = outward + step * np.pi / 8
                 way = np.array([np.cos(angle), np.sin(angle)])
-                centre = spheres[i].centre + way * (spheres[i].radius + gap * half) + way * size / 2
-                box = (*(centre - size / 2), *(centre + size / 2))
-                cost = sum(_overlap(box, other) for other in taken) + sum(_covers(box, s) for s in spheres)
-                cost += 10 * (np.abs(np.array(box)).max() > 0.99 * half)
+                centre = centres[i] + way * (radius[i] + gap * half) + way * size / 2
+                low, high = centre - size / 2, centre + size / 2
+                cost = ((low < boxes[:, 2:]) & (boxes[:, :2] < high)).all(axis=1).sum()
+                cost += (np.linalg.norm(np.clip(centres, low, high) - centres, axis=1) < radius).sum()
+                cost += 10 * (np.abs([low, high]).max() > 0.99 * half)
                 if best is None or cost < best[0]:
-                    best = (cost, centre, box, gap)
+                    best = (cost, centre, low, high, gap)
             if best[0] == 0:
                 break
-        _, centre, box, gap = best
-        taken.append(box)
+        _, centre, low, high, gap = best
+        taken.append((*low, *high))
         if gap > 0.02:
-            near = np.clip(spheres[i].centre, box[:2], box[2:])
-            axes.plot(*np.array([spheres[i].centre, near]).T, color=FAINT, lw=0.7, zorder=6.4)
+            near = np.clip(centres[i], low, high)
+            axes.plot(*np.array([centres[i], near]).T, color=FAINT, lw=0.7, zorder=6.4)
         style = {"color": INK, "fontsize": FONT, "ha": "center", "va": "center", "parse_math": False}
         axes.text(*centre, text, zorder=9, **style)
-
-
-def _overlap(one: tuple, other: tuple) -> bool:
-    """Whether two boxes (left, bottom, right, top) overlap."""
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-def _covers(box: tuple, sphere: _Sphere) -> bool:
-    nearest = np.clip(sphere.centre, box[:2], box[2:])
-    return bool(np.linalg.norm(nearest - sphere.centre) < sphere.radius)

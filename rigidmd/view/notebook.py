@@ -24,11 +24,11 @@ from rigidmd.run.report import body_rows, body_title, stage_rows, stage_title
 from rigidmd.run.results import Results
 from rigidmd.run.simulation import Simulation
 from rigidmd.scene import BodyScene, MolecularScene, Scene
-from rigidmd.view.animation_page import FILM_STYLE, animation_parts
 from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.molecule_animation import describe_thinning, frames_of, inside, massive_bonds
 from rigidmd.view.page import Raw, figure, notes, page, read_asset, table
 from rigidmd.view.plots import record_of
+from rigidmd.view.run_page import FILM_STYLE, animation_parts
 
 if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
@@ -46,17 +46,17 @@ TableRow = tuple[str, str]
 
 @html_of.register
 def scene_html(scene: Scene) -> str:
-    return _framed(scene.name, _kind(scene), _table(_rows(scene)))
+    kind = "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
+    return _framed(scene.name, kind, _table(_rows(scene)))
 
 
 @html_of.register
 def simulation_html(simulation: Simulation) -> str:
     folder = simulation.folder
     where = "nowhere: the results stay in memory" if folder is None else str(folder)
-    user_rows = [
-        (USER_FORCES, f"{name}: {words}") for name, words in getattr(simulation.system, "user_terms", {}).items()
-    ]
-    rows = [*(row for row in _rows(simulation.scene) if row[0] != USER_FORCES), *user_rows]
+    rows = [row for row in _rows(simulation.scene) if row[0] != USER_FORCES]
+    user_terms: dict[str, str] = getattr(simulation.system, "user_terms", {})
+    rows += [(USER_FORCES, f"{name}: {words}") for name, words in user_terms.items()]
     rows += [("threads", str(simulation.threads)), ("writes to", where)]
     if names := [type(observer).__name__ for observer in simulation.observers]:
         rows.append(("observers", ", ".join(names)))
@@ -74,8 +74,12 @@ def results_html(results: Results) -> str:
             text += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]
     drawn = run_figures(results.system, results.samples, summary)
     left = f"<div>{''.join(text)}{notes(summary['notes'])}</div>"
-    name, first = next(iter(drawn.items()), ("", None))
-    right = "" if first is None else f"<div>{_svg(first, name, results)}</div>"
+    right = ""
+    for name, drawing in list(drawn.items())[:1]:
+        # in the colours of the notebook, or on white if it has a shaded solid
+        svg = figure(drawing, f"{results.system.scene.name}-{name}", f"figure: {name}").replace("#000000", "var(--ink)")
+        svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
+        right = f'<div><div class="{"paper" if "<image" in svg else "figure"}">{svg}</div></div>'
     body = f'<div class="sides">{left}{right}</div>{_columns(results)}'
     return _framed(results.system.scene.name, results._summary_line, body)
 
@@ -92,17 +96,6 @@ def _table(rows: Iterable[TableRow]) -> str:
         text.append(("" if name == before else name, value))
         before = name
     return table([], text, words=True)
-
-
-def _svg(drawn, name: str, results: Results) -> str:
-    """A figure in the colours of the notebook, or on white if it has a shaded solid."""
-    found = figure(drawn, f"{results.system.scene.name}-{name}", f"figure: {name}").replace("#000000", "var(--ink)")
-    found = found.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
-    return f'<div class="{"paper" if "<image" in found else "figure"}">{found}</div>'
-
-
-def _kind(scene: Scene) -> str:
-    return "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
 
 
 def _rows(scene: Scene) -> list[TableRow]:
@@ -177,19 +170,14 @@ def _columns(results: Results) -> str:
     families: dict[tuple[str, str], list[str]] = {}
     for name, column in results.samples.described.items():
         families.setdefault((column.unit, column.about), []).append(name)
-    rows = [
-        (Raw(" ".join(f"<code>{name}</code>" for name in names)), unit, _ends(results, names), about)
-        for (unit, about), names in families.items()
-    ]
+    rows = []
+    for (unit, about), names in families.items():
+        values, ends = results[names[0]], ""
+        if len(names) == 1 and values.ndim == 1 and len(values):
+            ends = " ... ".join(x if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
+        rows.append((Raw(" ".join(f"<code>{name}</code>" for name in names)), unit, ends, about))
     listed = table(["column", "unit", "first ... last", ""], rows, words=True)
     return f"<details><summary>{len(results.units)} columns: results[name]</summary>{listed}</details>"
-
-
-def _ends(results: Results, columns: list[str]) -> str:
-    values = results[columns[0]]
-    if len(columns) > 1 or values.ndim > 1 or len(values) == 0:
-        return ""
-    return " ... ".join(str(x) if isinstance(x, str) else f"{x:.6g}" for x in values[[0, -1]])
 
 
 #: Most coordinates in a widget, which a notebook stores as text.
@@ -222,9 +210,8 @@ def show_animation(results: Results) -> "StructureWidget | AnimationPage":
     try:
         import chemiscope
     except ImportError:
-        raise ImportError(
-            "rigidmd.view.show() of molecules needs the extra rigidmd[view]: pip install chemiscope"
-        ) from None
+        needed = "rigidmd.view.show() of molecules needs the extra rigidmd[view]: pip install chemiscope"
+        raise ImportError(needed) from None
     system = results.system
     massive = np.flatnonzero(system.sites.mass > 0)
     frames = _frames(results, system, max(2, MOST_COORDINATES // (3 * len(massive))))

@@ -48,22 +48,19 @@ def panels(record: Record) -> list[Panel]:
 def _molecular_panels(record: Record) -> list[Panel]:
     seen, n, shown = record.columns, len(record.molecules.model.species), record.moving
 
-    def curves(*names: tuple[str, str], per: int = 1) -> list[tuple[str, np.ndarray]]:
-        return [
-            (label, seen[name] / per) for name, label in names if name in seen and np.isfinite(seen[name][shown]).any()
-        ]
+    def curves(per: int = 1, **labels: str) -> list[tuple[str, np.ndarray]]:
+        there = [name for name in labels if name in seen and np.isfinite(seen[name][shown]).any()]
+        return [(labels[name], seen[name] / per) for name in there]
 
     found = [
-        Panel(
-            "temperature (K)", curves(("temperature_translation", "translation"), ("temperature_rotation", "rotation"))
-        ),
-        Panel("potential energy (kJ/mol per molecule)", curves(("potential", ""), per=n)),
-        Panel("drift of the conserved energy in a stage (kJ/mol per molecule)", curves(("drift", ""), per=n)),
-        Panel("pressure (bar)", curves(("pressure_bar", ""))),
+        Panel("temperature (K)", curves(temperature_translation="translation", temperature_rotation="rotation")),
+        Panel("potential energy (kJ/mol per molecule)", curves(n, potential="")),
+        Panel("drift of the conserved energy in a stage (kJ/mol per molecule)", curves(n, drift="")),
+        Panel("pressure (bar)", curves(pressure_bar="")),
     ]
     if "density" in seen and np.ptp(np.nan_to_num(seen["density"])) > 0:
-        found.append(Panel("density (g/cm³)", curves(("density", ""))))
-        found.append(Panel("edges of the box (Å)", curves(("a", "a"), ("b", "b"), ("c", "c"))))
+        found.append(Panel("density (g/cm³)", curves(density="")))
+        found.append(Panel("edges of the box (Å)", curves(a="a", b="b", c="c")))
     return found
 
 
@@ -76,8 +73,8 @@ def _body_panels(record: Record) -> list[Panel]:
         in_turns = max(np.ptp(values) for _, values in angles) > 2 * np.pi
         unit, size = ("turns", 2 * np.pi) if in_turns else ("°", np.pi / 180)
         found.append(Panel(f"φ and ψ ({unit})", [(name, values / size) for name, values in angles]))
-        omega = [("₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
-        found.append(Panel("ω along the body's axes (rad/s)", [(f"ω{k}", values) for k, values in omega]))
+        omega = [("ω" + "₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
+        found.append(Panel("ω along the body's axes (rad/s)", omega))
     if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.body.translates:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
@@ -94,21 +91,18 @@ def _body_panels(record: Record) -> list[Panel]:
 def plots_part(record: Record) -> str:
     """All plots as HTML. Attributes for the animation: data-left and data-right, the ends of the time axis as fractions
     of the width, data-from and data-to, its limits."""
-    figures = "".join(_panel_part(record, k, panel) for k, panel in enumerate(panels(record)))
-    return f'<div class="plots">{figures}</div>'
-
-
-def _panel_part(record: Record, k: int, panel: Panel) -> str:
-    figure = new_figure(WIDTH, HEIGHT)
-    axis = figure.subplots()
-    draw_panel(axis, record, panel)
-    axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
-    axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
-    svg = figure_part(figure, f"panel{k}", panel.title)
-    box = axis.get_position()
-    left, right = axis.get_xlim()
-    where = f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
-    return f"<figure {where}>{svg}</figure>"
+    figures = []
+    for k, panel in enumerate(panels(record)):
+        figure = new_figure(WIDTH, HEIGHT)
+        axis = figure.subplots()
+        draw_panel(axis, record, panel)
+        axis.set_title(panel.title, loc="left", fontsize=9, color=INK)
+        axis.set_xlabel(f"time ({record.time_unit})", fontsize=8, color=INK)
+        svg = figure_part(figure, f"panel{k}", panel.title)  # sets the position of the axis
+        box, (left, right) = axis.get_position(), axis.get_xlim()
+        where = f'data-left="{box.x0:.5f}" data-right="{box.x1:.5f}" data-from="{left:.9g}" data-to="{right:.9g}"'
+        figures.append(f"<figure {where}>{svg}</figure>")
+    return f'<div class="plots">{"".join(figures)}</div>'
 
 
 def draw_panel(axis, record: Record, panel: Panel) -> None:
@@ -155,12 +149,11 @@ def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Picture":
     figures = {}
     if not set(names[:1]) & set(results.units):
         figures = run_figures(results.system, results.samples, results.summary)
-    if not names:
-        if not figures:
-            raise ValueError(f"too few samples for a figure: {len(results.samples)}")
-        return next(iter(figures.values()))
-    if len(names) == 1 and names[0] in figures:
-        return figures[names[0]]
+    if not names and not figures:
+        raise ValueError(f"too few samples for a figure: {len(results.samples)}")
+    wanted = names or tuple(figures)[:1]
+    if len(wanted) == 1 and wanted[0] in figures:
+        return figures[wanted[0]]
     check_names(names, results.samples.described, figures)
     record = record_of(results.system, results.samples, results.summary, list(names))
     return columns_figure(record, names, results.samples.described, log)
@@ -169,9 +162,7 @@ def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Picture":
 def check_names(names: Sequence[str], described: dict[str, Column], figures: Any = ()) -> None:
     """Raise KeyError, with a suggestion, for a name that is not a column of numbers."""
     known = [name for name, column in described.items() if column.unit and name != MATRIX]
-    for name in names:
-        if name in known:
-            continue
+    for name in (name for name in names if name not in known):
         if name in described:
             raise KeyError(f"column {name!r} has {'matrices' if name == MATRIX else 'text'}, which are not plotted")
         hint = did_you_mean(name, [*known, *figures]) or f"; there are {', '.join([*known, *figures])}"

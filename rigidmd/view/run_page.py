@@ -1,6 +1,11 @@
-"""The page of a run, without animation: system, means with errors, plots, stability margins, files, how to repeat."""
+"""The page of a run: system, means with errors, plots, stability margins, files, how to repeat; and with its animation.
 
+Chemiscope, whose JavaScript is in the page, draws the animation of molecules.
+"""
+
+import base64
 import html
+import json
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +20,9 @@ from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run.record import Record, read_record
 from rigidmd.view import plots
-from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, section, table
+from rigidmd.view.body_animation import BodyAnimation
+from rigidmd.view.molecule_animation import MoleculeAnimation
+from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, read_asset, section, table
 
 REPORT = "report.html"
 #: Columns of the table of means: name in the log, title; per molecule or not.
@@ -93,8 +100,7 @@ def _means(record: Record) -> str:
             cells.append("" if value is None else format_with_error(value, error))
         rows.append(cells)
     text = "Means over a whole stage ± one standard error, from log.csv, without minimisations; few rows have no error."
-    text = f'<p class="faint">{text}</p>'
-    return table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows) + text
+    return f'{table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows)}<p class="faint">{text}</p>'
 
 
 def _drifts(record: Record) -> str:
@@ -142,8 +148,8 @@ def _number(value: float | None) -> str:
 
 
 def _body_table(record: Record) -> str:
-    seen, rows = record.columns, []
-    rows.append(["time", f"{record.time[-1]:g} s, {len(record.time)} samples"])
+    seen = record.columns
+    rows = [["time", f"{record.time[-1]:g} s, {len(record.time)} samples"]]
     rows.append(["energy", f"{seen['energy'][0]:.9g} J at the start, {seen['energy'][-1]:.9g} J at the end"])
     if seen["work"].any():
         rows.append(["work", f"{seen['work'][-1]:.9g} J done on the body"])
@@ -171,10 +177,8 @@ def _margins(record: Record) -> str:
         if stage.get(step) and stage.get(stable):
             fraction = stage[step] / stage[stable]
             kind, word = next(entry[1:] for entry in MARGINS if fraction <= entry[0])
-            rows.append(
-                [stage["name"], f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * fraction:.2g} %",
-                 Raw(f'<span class="{kind}">{word}</span>')]
-            )  # fmt: skip
+            sizes = [f"{stage[step]:g}", f"{stage[stable]:.3g}", f"{100 * fraction:.2g} %"]
+            rows.append([stage["name"], *sizes, Raw(f'<span class="{kind}">{word}</span>')])
     more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
     text = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
     titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""]
@@ -218,21 +222,61 @@ def _size(size: float) -> str:
     return f"{size:.3g} GB"
 
 
-def _provenance_value(value: object) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {digest}" for key, digest in value.items())
-    return str(value)
-
-
 def _repeat(record: Record) -> Iterator[str]:
     summary, folder = record.summary or {}, shlex.quote(str(record.folder))
     yield code(
         f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
         f"rigidmd compare {folder} {folder}-again    # to the same bits"
     )
-    yield table(
-        [], [[name, _provenance_value(summary[key])] for key, name in PROVENANCE if summary.get(key)], words=True
-    )
+    rows = [[name, value] for key, name in PROVENANCE if (value := summary.get(key))]
+    for row in rows:
+        if isinstance(row[1], dict):
+            row[1] = ", ".join(f"{key} {digest}" for key, digest in row[1].items())
+    yield table([], rows, words=True)
     seconds = [f"{summary[key]:.1f} s {word}" for key, word in (("preparing_s", "to compile and prepare"),
                ("computing_s", "of steps"), ("wall_s", "in all, output included")) if summary.get(key)]  # fmt: skip
     yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""
+
+
+VIEW = "view.html"
+FILM_STYLE = f"<style>{read_asset('film.css')}</style>"
+BAR = """<div class="bar noprint"><button id="film-play" aria-label="play">▶</button>
+<button id="film-back" aria-label="a frame back">◂</button><button id="film-on" aria-label="a frame on">▸</button>
+<input id="film-slider" type="range" min="0" max="100000" value="0" aria-label="time">
+<span id="film-clock" class="clock"></span><select id="film-speed" aria-label="speed"></select></div>"""
+
+
+def animation_of(record: Record, most_frames: int | None = None) -> BodyAnimation | MoleculeAnimation:
+    """The animation of a run. most_frames : of molecules; default: as many as a page holds. Raises OutputError."""
+    return BodyAnimation(record) if record.is_body else MoleculeAnimation(record, most_frames)
+
+
+def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
+    """Write the page of the run in a folder. Returns its path, and notes on data left out. Raises OutputError."""
+    record = read_record(folder)
+    animation = animation_of(record)
+    first, *others = animation_parts(record, animation)
+    write_text(path, page(f"{record.scene.name}: the film of a run", [*parts(record, first), *others], FILM_STYLE))
+    return path, [*record.missing, *animation.notes]
+
+
+def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation) -> list[str]:
+    """The animation next to the plots, its data and its scripts, as HTML."""
+    part = animation.page_part()
+    left = f'<div><div class="stage">{part.picture}{BAR}<div class="readout" id="film-readout"></div></div>'
+    left += f'<p class="legend">{part.legend}</p><p class="faint noprint">{part.usage}</p>'
+    left += f'<div class="faint">{items(part.notes)}</div></div>'
+
+    def packed(values: np.ndarray) -> str:
+        """The bytes of an array, as base64."""
+        return base64.b64encode(np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()).decode()
+
+    data = json.dumps(part.data, ensure_ascii=False, separators=(",", ":"), allow_nan=False, default=packed)
+    data = data.replace("<", "\\u003c")
+    if any("</script" in text.lower() for text in part.scripts):
+        raise ValueError("a script has the end tag of its element")
+    return [
+        f'<div class="film">{left}{plots.plots_part(record)}</div>',
+        f'<script type="application/json" id="film-data">{data}</script>',
+        *(f"<script>{text}</script>" for text in part.scripts),
+    ]

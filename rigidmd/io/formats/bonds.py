@@ -14,9 +14,21 @@ FLAT, THIN = 1e-6, 1e-9
 
 
 def connections(system: Any, massless: bool = False) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined. `massless`: whether massless sites are joined to their nearest atoms, so
-    that each molecule is connected."""
-    return _bonds_of_molecules(system, massless) if hasattr(system, "species") else _edges_of_body(system)
+    """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull of a solid or the
+    shortest links between points, with a link from a pinned body to its pivot. `massless`: whether massless sites are
+    joined to their nearest atoms, so that each molecule is connected."""
+    if hasattr(system, "species"):
+        starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
+        chosen = [[pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species]
+        links = [np.array(pairs, int).reshape(-1, 2) for pairs in chosen]
+        return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
+    first = 0 if system.translates else 1  # the pivot is the first point
+    points = system.points[first:]
+    pairs = first + (shortest_links(points) if system.scene.body.points is not None else _hull(points))
+    if first and len(points):
+        nearest = int(np.linalg.norm(points - system.centre, axis=1).argmin())
+        pairs = np.vstack([[0, first + nearest], pairs])
+    return pairs.astype(int)
 
 
 def charges(system: Any) -> np.ndarray:
@@ -24,28 +36,8 @@ def charges(system: Any) -> np.ndarray:
     return system.of_sites(lambda m: m.charges) if hasattr(system, "species") else np.zeros(len(system.points))
 
 
-def _bonds_of_molecules(system: Any, massless: bool) -> np.ndarray:
-    starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
-    links = [
-        np.array([b for b in bonds(m) if massless or m.masses[b[1]] > 0], int).reshape(-1, 2) for m in system.species
-    ]
-    return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
-
-
-def _edges_of_body(system: Any) -> np.ndarray:
-    """Edges of the hull of a solid, or the shortest links between points. A pinned body is linked to the pivot."""
-    first = 0 if system.translates else 1  # the pivot is the first point
-    points = system.points[first:]
-    found = _shortest(points) if system.scene.body.points is not None else _hull(points)
-    pairs = found + first
-    if first and len(points):
-        nearest = int(np.linalg.norm(points - system.centre, axis=1).argmin())
-        pairs = np.vstack([[0, first + nearest], pairs]) if len(pairs) else np.array([[0, first + nearest]])
-    return pairs.reshape(-1, 2).astype(int)
-
-
-def _shortest(points: np.ndarray) -> np.ndarray:
-    """The shortest links that connect points."""
+def shortest_links(points: np.ndarray) -> np.ndarray:
+    """Pairs (n - 1, 2) of points (n, 3): the shortest links that connect them."""
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import cdist
 
@@ -89,14 +81,14 @@ def bonds(m: Any) -> list[tuple[int, int]]:
     atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
     part = {i: i for i in atoms}
     found = []
-    for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(_distance(m, *pair), 9)):
+    for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(distance(m, *pair), 9)):
         reach = SLACK * sum(COVALENT.get(m.elements[s], 0.0) for s in (i, j))
-        if _distance(m, i, j) <= reach or part[i] != part[j]:
+        if distance(m, i, j) <= reach or part[i] != part[j]:
             found.append((i, j) if m.masses[i] >= m.masses[j] else (j, i))
             part = {s: part[i] if p == part[j] else p for s, p in part.items()}
     massless: list[int] = np.flatnonzero(m.masses == 0).tolist()
-    return sorted(found) + [(min(atoms, key=lambda i, s=s: round(_distance(m, i, s), 9)), s) for s in massless]
+    return sorted(found) + [(min(atoms, key=lambda i, s=s: round(distance(m, i, s), 9)), s) for s in massless]
 
 
-def _distance(m: Any, i: int, j: int) -> float:
+def distance(m: Any, i: int, j: int) -> float:
     return float(np.linalg.norm(m.positions_body[i] - m.positions_body[j]))

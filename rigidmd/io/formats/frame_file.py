@@ -3,7 +3,7 @@
 import contextlib
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,6 @@ class FrameFile(ABC):
         self._velocities, self._wrapped = velocities, wrapped
         self._sum, self._frames, self._kept = 0, 0, kept
         self._file: Any = None
-        self._begin()
         if kept is None:
             self._open_new()
         elif kept[1]:
@@ -97,11 +96,6 @@ class FrameFile(ABC):
             raise OutputError(f"{self._path} cannot be written: {_reason(error)}") from None
 
     @abstractmethod
-    @abstractmethod
-    def _begin(self) -> None:
-        """Set what is the same in all frames."""
-
-    @abstractmethod
     def _open(self, path: Path, mode: str) -> Any:
         """The file of the library, to write "w" or to append "a"."""
 
@@ -113,7 +107,7 @@ class FrameFile(ABC):
     def _append(self, file: Any, frame: Any) -> None: ...
 
     @abstractmethod
-    def _arrays(self, frame: Any) -> Iterator[np.ndarray]:
+    def _arrays(self, frame: Any) -> Iterable[np.ndarray]:
         """The arrays of a frame, for the checksum."""
 
     @abstractmethod

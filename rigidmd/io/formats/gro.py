@@ -5,14 +5,12 @@ from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format
-from rigidmd.io.formats.atoms import Atoms, structure_error
-from rigidmd.io.formats.text import numbers, unexpected
+from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
 
 
 def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
@@ -68,13 +66,10 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
 
 
-def write_topology(path: Path, sites: Any) -> None:
-    sites.write(str(path))
-
-
 FORMATS = [
     Format(
-        (".gro",), read=read_gro, write_topology=write_topology, limits=(-9999.9, 99999.9),  # columns of eight
+        (".gro",), read=read_gro, write_topology=lambda path, sites: sites.write(str(path)),
+        limits=(-9999.9, 99999.9),  # columns of eight
         content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
     ),
 ]  # fmt: skip

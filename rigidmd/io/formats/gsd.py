@@ -8,7 +8,7 @@ positions are unwrapped. Files are read chunk by chunk, and sizes are checked be
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format
+from rigidmd.io.formats import Format, System
 from rigidmd.io.formats.atoms import Atoms, Frame, structure_error
 from rigidmd.io.formats.bonds import charges, connections
 from rigidmd.io.formats.frame_file import FrameFile
@@ -96,15 +96,22 @@ class GsdReader:
         if n < 1 or position is None or position.shape != (n, 3):
             raise ValueError(f"frame {frame + 1} holds no positions of {n} particles")
         of = partial(self._of_particles, frame, n)
-        types, kind = self._types(frame), of("typeid", (), 0).astype(int)
+        types, kind = ["A"], of("typeid", (), 0).astype(int)  # the default of the schema
+        if (names := self._chunk(frame, "particles/types")) is not None:
+            if names.ndim != 2 or names.dtype.itemsize != 1:
+                raise ValueError("its names of types are not text")
+            types = [row.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace") for row in names]
         if not 0 <= kind.min() <= kind.max() < len(types):
             raise ValueError(f"frame {frame + 1} has a particle without a type")
         body = of("body", (), -1).astype(np.int32).astype(int)  # -1 is often stored unsigned
         if body.max() >= n:
             raise ValueError(f"frame {frame + 1} has a particle of a body that does not exist")
-        cell = self._cell(frame)
-        position = position.astype(float)
-        if cell is not None:
+        position, box, cell = position.astype(float), self._chunk(frame, "configuration/box"), None
+        if box is not None and box.any():
+            if box.shape != (6,):
+                raise ValueError(f"frame {frame + 1}: its box has {box.shape} numbers, must be 6")
+            lx, ly, lz, xy, xz, yz = box.astype(float)
+            cell = np.array([[lx, 0, 0], [xy * ly, ly, 0], [xz * lz, yz * lz, lz]])
             position += (of("image", (3,), 0) + 0.5) @ cell
         orientation = of("orientation", (4,), (1, 0, 0, 0)).astype(float)
         length = np.linalg.norm(orientation, axis=1, keepdims=True)
@@ -149,23 +156,6 @@ class GsdReader:
             raise ValueError(f"frame {frame + 1}: particles/{name} is of {found.shape}, must be {(n, *width)}")
         return found
 
-    def _types(self, frame: int) -> list[str]:
-        found = self._chunk(frame, "particles/types")
-        if found is None:
-            return ["A"]  # default of the schema
-        if found.ndim != 2 or found.dtype.itemsize != 1:
-            raise ValueError("its names of types are not text")
-        return [row.tobytes().split(b"\0", 1)[0].decode("utf-8", errors="replace") for row in found]
-
-    def _cell(self, frame: int) -> np.ndarray | None:
-        found = self._chunk(frame, "configuration/box")
-        if found is None or not found.any():
-            return None
-        if found.shape != (6,):
-            raise ValueError(f"frame {frame + 1}: its box has {found.shape} numbers, must be 6")
-        lx, ly, lz, xy, xz, yz = found.astype(float)
-        return np.array([[lx, 0, 0], [xy * ly, ly, 0], [xz * lz, yz * lz, lz]])
-
 
 def box_of(cell: np.ndarray) -> list[float]:
     """A cell (3, 3) as edges along the axes and tilts; all 0 without a cell."""
@@ -199,12 +189,38 @@ def _refusals() -> Iterator[None]:
 
 #: Diameter, Å, of central particles in viewers.
 DOT = 0.1
-#: Properties that change from frame to frame, and their types in the file.
-POSITIONS = {"position": np.float32, "image": np.int32, "orientation": np.float32}
-MOMENTA = {"velocity": np.float32, "angmom": np.float32}
 
 
 class GsdFile(FrameFile):
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+        """Set the constant properties. Particles are molecules, then the sites of molecules with several sites."""
+        self._changing = ["position", "image", "orientation", *(("velocity", "angmom") if velocities else ())]
+        molecule, species = system.sites.molecule, system.model.species
+        single = np.bincount(molecule) == 1
+        n = len(single)
+        constituent = ~single[molecule]
+        self._constituent = np.flatnonzero(constituent)
+        particle = np.where(constituent, n + np.cumsum(constituent) - 1, molecule)  # of each site
+        site_labels = _labels(system)
+        names = [m.name if m.name not in site_labels else f"{m.name}_body" for m in system.species]
+        label = np.array([names[k] for k in species] + [""] * len(self._constituent), dtype=object)
+        label[particle] = site_labels
+        types = list(dict.fromkeys(label.tolist()))
+        mass = np.array([m.mass for m in system.species])[species]
+        moments = np.array([m.inertia for m in system.species])[species]
+        charge = np.zeros(len(label))
+        charge[particle] = charges(system)
+        central = set(label[:n][~single])
+        self._constant: dict[str, Any] = {
+            "types": types, "typeid": np.array([types.index(name) for name in label]),
+            "type_shapes": [{"type": "Sphere", "diameter": DOT} if name in central else {} for name in types],
+            "body": np.concatenate([np.where(single, -1, np.arange(n)), molecule[constituent]]),
+            "mass": np.concatenate([mass, system.sites.mass[constituent]]), "charge": charge,
+            "moment_inertia": np.vstack([moments, np.zeros((len(self._constituent), 3))]),
+        }  # fmt: skip
+        self._bonds = particle[connections(system)]
+        super().__init__(path, system, velocities, wrapped, kept)
+
     def _open(self, path: Path, mode: str) -> Any:
         import gsd.hoomd  # slow to import
 
@@ -223,82 +239,32 @@ class GsdFile(FrameFile):
             for k in range(count):
                 yield old[k]
 
-    def _begin(self) -> None:
-        """Set the constant properties. Particles are molecules, then the sites of molecules with several sites."""
-        self._changing = POSITIONS | MOMENTA if self._velocities else POSITIONS
-        system = self._system
-        molecule, species = system.sites.molecule, system.model.species
-        single = np.bincount(molecule) == 1
-        n = len(single)
-        constituent = ~single[molecule]
-        self._constituent = np.flatnonzero(constituent)
-        particle = np.where(constituent, n + np.cumsum(constituent) - 1, molecule)  # of each site
-        site_labels = self._labels()
-        names = [m.name if m.name not in site_labels else f"{m.name}_body" for m in system.species]
-        label = np.array([names[k] for k in species] + [""] * len(self._constituent), dtype=object)
-        label[particle] = site_labels
-        types = list(dict.fromkeys(label.tolist()))
-        mass = np.array([m.mass for m in system.species])[species]
-        moments = np.array([m.inertia for m in system.species])[species]
-        charge = np.zeros(len(label))
-        charge[particle] = charges(system)
-        central = set(label[:n][~single])
-        self._constant: dict[str, Any] = {
-            "types": types, "typeid": np.array([types.index(name) for name in label]),
-            "type_shapes": [{"type": "Sphere", "diameter": DOT} if name in central else {} for name in types],
-            "body": np.concatenate([np.where(single, -1, np.arange(n)), molecule[constituent]]),
-            "mass": np.concatenate([mass, system.sites.mass[constituent]]), "charge": charge,
-            "moment_inertia": np.vstack([moments, np.zeros((len(self._constituent), 3))]),
-        }  # fmt: skip
-        self._bonds = particle[connections(system)]
-
-    def _labels(self) -> np.ndarray:
-        """Type of each site (s,): its element, or its name without element, with the species if it is ambiguous."""
-        of_scene, of_species = defaultdict(set), defaultdict(set)
-
-        def names_of(m: Any) -> list[str]:
-            return [name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)]
-
-        for m in self._system.species:
-            for name, *kind in zip(names_of(m), m.masses, m.charges, m.sigma, m.epsilon, strict=True):
-                of_scene[name].add(tuple(kind))
-                of_species[m.name, name].add(tuple(kind))
-
-        def label(species: str, name: str, site: str) -> str:
-            if len(of_scene[name]) == 1:
-                return name
-            return f"{species}.{name if len(of_species[species, name]) == 1 else site}"
-
-        def labels(m: Any) -> np.ndarray:
-            return np.array([label(m.name, *names) for names in zip(names_of(m), m.site_names, strict=True)], object)
-
-        return self._system.of_sites(labels)
-
     def _frame(self, state: State, time: float, step: int) -> Any:
+        import gsd.hoomd
+
         system, sites = self._system, self._constituent
         owner, n = system.sites.molecule[sites], len(state.position)
         orientation = to_quaternion(state.rotation) if len(state.rotation) else np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        where = np.vstack([system.centres(state, self._wrapped), system.site_positions(state, self._wrapped)[sites]])
-        position, image = _inside(state.cell, where)
-        found = {"position": position, "image": image}
-        found["orientation"] = np.vstack([orientation, orientation[owner]])
+        position = np.vstack([system.centres(state, self._wrapped), system.site_positions(state, self._wrapped)[sites]])
+        image = np.zeros(position.shape)
+        if np.isfinite(state.cell).all():
+            image = np.floor(np.linalg.solve(state.cell.T, position.T).T)
+            position = position - (image + 0.5) @ state.cell  # in the box that is centred at the origin
+        found = {"position": position, "image": image, "orientation": np.vstack([orientation, orientation[owner]])}
         if self._velocities:
             found["velocity"] = np.vstack([state.velocity, system.site_velocities(state)[sites]])
-            momentum = np.zeros((n + len(sites), 4))
+            found["angmom"] = np.zeros((n + len(sites), 4))
             if len(state.rotation):
-                momentum[:n] = momentum_quaternion(orientation, state.angular_momentum_body)
-            found["angmom"] = momentum
-        import gsd.hoomd
-
+                found["angmom"][:n] = momentum_quaternion(orientation, state.angular_momentum_body)
         frame: Any = gsd.hoomd.Frame()
         frame.configuration.step = step
         frame.configuration.dimensions = 3
         frame.configuration.box = np.array(box_of(state.cell), np.float32)
         frame.log[TIME] = np.array([time])
-        frame.particles.N, frame.bonds.N = len(where), len(self._bonds)
+        frame.particles.N, frame.bonds.N = len(position), len(self._bonds)
         for name, values in found.items():
             # in the type of the file, because the library compares it with the first frame and leaves equal chunks out
-            setattr(frame.particles, name, values.astype(self._changing[name]))
+            setattr(frame.particles, name, values.astype(np.int32 if name == "image" else np.float32))
         if self._frames == 0:
             for name, values in self._constant.items():
                 setattr(frame.particles, name, values)
@@ -306,19 +272,32 @@ class GsdFile(FrameFile):
             frame.bonds.typeid = np.zeros(len(self._bonds), int)
         return frame
 
-    def _arrays(self, frame: Any) -> Iterator[np.ndarray]:
-        yield np.asarray(frame.configuration.box, np.float32)
-        yield np.asarray(frame.log[TIME], float)
-        for name, kind in self._changing.items():
-            yield np.asarray(getattr(frame.particles, name), kind)
+    def _arrays(self, frame: Any) -> list[np.ndarray]:
+        changing = [getattr(frame.particles, name) for name in self._changing]
+        return [frame.configuration.box, frame.log[TIME], *changing]
 
 
-def _inside(cell: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 3) in the box that is centred at the origin, and their image numbers (N, 3)."""
-    if not np.isfinite(cell).all():
-        return position, np.zeros(position.shape, np.int32)
-    image = np.floor(np.linalg.solve(cell.T, position.T).T)
-    return position - (image + 0.5) @ cell, image.astype(np.int32)
+def _labels(system: System) -> np.ndarray:
+    """Type of each site (s,): its element, or its name without element, with the species if it is ambiguous."""
+    kinds = defaultdict(set)  # properties of sites by name, and by species and name
+
+    def names_of(m: Any) -> list[str]:
+        return [name if e == "X" else e for e, name in zip(m.elements, m.site_names, strict=True)]
+
+    for m in system.species:
+        for name, *kind in zip(names_of(m), m.masses, m.charges, m.sigma, m.epsilon, strict=True):
+            kinds[name].add(tuple(kind))
+            kinds[m.name, name].add(tuple(kind))
+
+    def label(m: Any, name: str, site: str) -> str:
+        if len(kinds[name]) == 1:
+            return name
+        return f"{m.name}.{name if len(kinds[m.name, name]) == 1 else site}"
+
+    def labels(m: Any) -> np.ndarray:
+        return np.array([label(m, *names) for names in zip(names_of(m), m.site_names, strict=True)], object)
+
+    return system.of_sites(labels)
 
 
 def read_frame(path: Path, frame: int) -> Atoms:

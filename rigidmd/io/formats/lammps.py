@@ -12,8 +12,17 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 from rigidmd.io.formats import Format
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of_mass, is_element, structure_error
-from rigidmd.io.formats.text import atom_count, numbers, table, unexpected
+from rigidmd.io.formats.atoms import (
+    HEAVY_HYDROGEN,
+    Atoms,
+    atom_count,
+    element_of_mass,
+    is_element,
+    numbers,
+    structure_error,
+    table,
+    unexpected,
+)
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
 #: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns that are not used.

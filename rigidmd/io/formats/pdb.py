@@ -6,14 +6,12 @@ from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rigidmd.io.formats import Format, System
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, numbers, structure_error, unexpected
 from rigidmd.io.formats.cells import cell_of
-from rigidmd.io.formats.text import numbers, unexpected
 from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
@@ -114,14 +112,11 @@ def encoder(system: System, interval: float, velocities: bool) -> Callable[[Fram
     return encode
 
 
-def write_topology(path: Path, sites: Any) -> None:
-    sites.write(str(path), bonds="all")
-
-
 FORMATS = [
     Format(
         (".pdb", ".ent"), read=read_pdb, encoder=encoder, times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
         content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
-        write_topology=write_topology, limits=(-999.99, 9999.99),  # columns of eight
+        write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
+        limits=(-999.99, 9999.99),  # columns of eight
     ),
 ]  # fmt: skip

@@ -6,7 +6,7 @@ item by item, and sizes are checked before arrays are allocated.
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format
+from rigidmd.io.formats import Format, System
 from rigidmd.io.formats.atoms import Atoms, Frame
 from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.io.formats.through_ase import ASE_VELOCITY, atoms_of_sites, from_ase, read_by_ase
@@ -24,6 +24,8 @@ TAG = "ASE-Trajectory"
 ATOMS, MASSLESS, MASSLESS_VELOCITY = "rigidmd_atoms", "rigidmd_massless", "rigidmd_massless_velocity"
 #: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
 HEAD = 48
+#: What the library raises for damaged files.
+DAMAGE = (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError)
 
 
 class Stored(NamedTuple):
@@ -51,7 +53,7 @@ class TrajReader:
             raise ValueError("not a trajectory of ASE, or damaged")
         try:
             self._file = ulm.Reader(path)
-        except (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        except DAMAGE as error:
             raise ValueError(f"it is damaged: {error}") from None
         try:
             if self._file.get_tag() != TAG:
@@ -75,19 +77,18 @@ class TrajReader:
     def read(self, k: int) -> Stored:
         try:
             item = self._file[k]
-            atoms, others = (len(self._atoms), 3), (self.sites - len(self._atoms), 3)
-            has = {name: name in item for name in ("momenta", MASSLESS, MASSLESS_VELOCITY)}
-            cell = np.array(item.cell, float)
+            cell: np.ndarray = np.array(item.cell, float)
             info: Any = item.get("info") or {}
             if cell.shape != (3, 3):
                 raise ValueError("it is damaged: a cell is not of shape (3, 3)")
+            atoms = len(self._atoms)
+            counts = {"momenta": atoms, MASSLESS: self.sites - atoms, MASSLESS_VELOCITY: self.sites - atoms}
+            there = [self._array(item, name, (n, 3)) if name in item else None for name, n in counts.items()]
             return Stored(
-                self._array(item, "positions", atoms), self._array(item, "momenta", atoms) if has["momenta"] else None,
-                self._array(item, MASSLESS, others) if has[MASSLESS] else None,
-                self._array(item, MASSLESS_VELOCITY, others) if has[MASSLESS_VELOCITY] else None,
+                self._array(item, "positions", (atoms, 3)), there[0], there[1], there[2],
                 cell if cell.any() else None, float(info["time_ps"]), int(info["step"]),
             )  # fmt: skip
-        except (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        except DAMAGE as error:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
     def frame(self, k: int) -> Frame:
@@ -112,7 +113,7 @@ class TrajReader:
             if there.dtype != kind or not fits or there.offset < 0 or there.offset + there.nbytes > self._size:
                 raise ValueError(f"it is damaged: {name} has the wrong type, shape or offset")
             found = np.array(there.read())
-        except (AssertionError, AttributeError, KeyError, TypeError, IndexError, OverflowError, MemoryError):
+        except (AssertionError, *DAMAGE):
             raise ValueError(f"it is damaged, or not a trajectory of rigidmd: it has no {name}") from None
         if kind is np.float64 and not np.isfinite(found).all():
             raise ValueError(f"it is damaged: {name} has values that are not finite")
@@ -122,12 +123,12 @@ class TrajReader:
 class TrajFile(FrameFile):
     """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and `ase.io.read`."""
 
-    def _begin(self) -> None:
-        system = self._system
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
         self._massive = np.flatnonzero(system.sites.mass > 0)
         self._massless = np.flatnonzero(system.sites.mass == 0)
         # its symbols, masses and periodicity are the same in every frame
         self._template = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        super().__init__(path, system, velocities, wrapped, kept)
 
     @property
     def kept(self) -> tuple[int, int]:
@@ -139,14 +140,15 @@ class TrajFile(FrameFile):
         system = self._system
         position = system.site_positions(state, self._wrapped)
         cell = state.cell if np.isfinite(state.cell).all() else None
-        momenta = others = of_others = None
+        momenta = of_massless = None
         if self._velocities:
             velocity = system.site_velocities(state)
             momenta = atoms_of_sites(system, position, velocity, state.cell, time).get_momenta()
-        if len(self._massless):
-            others = position[self._massless]
-            of_others = velocity[self._massless] if self._velocities else None
-        return Stored(position[self._massive], momenta, others, of_others, cell, float(time), int(step))
+            of_massless = velocity[self._massless]
+        massless = position[self._massless]
+        if not len(massless):
+            massless = of_massless = None
+        return Stored(position[self._massive], momenta, massless, of_massless, cell, float(time), int(step))
 
     def _append(self, file: Any, frame: Stored) -> None:
         atoms = self._template
@@ -170,9 +172,8 @@ class TrajFile(FrameFile):
             for k in range(count):
                 yield old.read(k)
 
-    def _arrays(self, frame: Stored) -> Iterator[np.ndarray]:
-        yield from (np.asarray(part, float) for part in frame[:5] if part is not None)
-        yield np.array([frame.time, float(frame.step)])
+    def _arrays(self, frame: Stored) -> list[np.ndarray]:
+        return [*(part for part in frame[:5] if part is not None), np.array([frame.time, float(frame.step)])]
 
     def _open(self, path: Path, mode: str) -> Any:
         from ase.io.trajectory import TrajectoryWriter  # slow to import

@@ -6,12 +6,18 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, System
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
-from rigidmd.io.formats.text import atom_count, numbers, without_fortran
+from rigidmd.io.formats.atoms import (
+    HEAVY_HYDROGEN,
+    Atoms,
+    Frame,
+    atom_count,
+    is_element,
+    numbers,
+    structure_error,
+    without_fortran,
+)
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import FrameFiles
 
@@ -72,12 +78,10 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
 
 def _residues(atoms) -> list[tuple] | None:
     """Residues from ASE's arrays of them; None without."""
-    if not {RESIDUE_NAMES, RESIDUE_NUMBERS} <= set(atoms.arrays):
+    names, numbers = (atoms.arrays.get(key) for key in (RESIDUE_NAMES, RESIDUE_NUMBERS))
+    if names is None or numbers is None or numbers.dtype.kind != "i":
         return None
-    numbers = atoms.arrays[RESIDUE_NUMBERS]
-    if numbers.dtype.kind != "i":
-        return None
-    return [(int(n), str(name)) for n, name in zip(numbers, atoms.arrays[RESIDUE_NAMES], strict=True)]
+    return [(int(n), str(name)) for n, name in zip(numbers, names, strict=True)]
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
@@ -95,21 +99,17 @@ def encoder(system: System, interval: float, velocities: bool) -> Callable[[Fram
     files = FrameFiles(system, velocities, "XYZ")
 
     def encode(frame: Frame, k: int) -> bytes:
+        box = 'pbc="F F F"'
+        if frame.cell is not None:
+            box = f'Lattice="{" ".join(f"{x:.9g}" for x in frame.cell.flat)}" pbc="T T T"'
+
         def write(writer, atoms):
-            writer.remark = _comment(frame.cell, frame.time)
+            writer.remark = f"{box} Properties=species:S:1:pos:R:3 Time={frame.time:.9g}"
             writer.write(atoms)
 
         return files.content(frame, write).removesuffix(b"\n\n") + b"\n"
 
     return encode
-
-
-def _comment(cell: np.ndarray | None, time: float) -> str:
-    box = 'pbc="F F F"'
-    if cell is not None:
-        edges = " ".join(f"{x:.9g}" for x in cell.flat)
-        box = f'Lattice="{edges}" pbc="T T T"'
-    return f"{box} Properties=species:S:1:pos:R:3 Time={time:.9g}"
 
 
 FORMATS = [

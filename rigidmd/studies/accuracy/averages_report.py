@@ -6,8 +6,7 @@ from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
-from rigidmd.io.table import Column, Table, with_error
-from rigidmd.io.write import write_json
+from rigidmd.io.write import Column, Table, with_error, write_json
 from rigidmd.studies.accuracy.bias import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
 from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
 

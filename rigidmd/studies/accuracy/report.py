@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, new_figure, open_axis, write_figure
-from rigidmd.io.table import Column, Table, with_error
+from rigidmd.io.write import Column, Table, with_error
 from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 

@@ -12,8 +12,7 @@ import numpy as np
 from rigidmd.core.files import write_text
 from rigidmd.errors import SceneError
 from rigidmd.figures.style import INK, curve_style, label_minor_ticks, new_figure, open_axis
-from rigidmd.io.table import format_cell
-from rigidmd.io.write import columns_text, write_csv
+from rigidmd.io.write import columns_text, format_cell, write_csv
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
 from rigidmd.studies.stability.cases import CASES, StabilityCase

@@ -13,8 +13,7 @@ from rigidmd.core.files import writing
 from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
-from rigidmd.io.table import Column, Table, with_error
-from rigidmd.io.write import nine_digits
+from rigidmd.io.write import Column, Table, nine_digits, with_error
 from rigidmd.studies.sweep.folder import FINISHED, describe_values, point_name, read_manifest, short_keys, state_on_disk
 from rigidmd.studies.sweep.table import key_columns
 

@@ -13,9 +13,8 @@ from rigidmd.core.statistics import format_with_error, mean_and_error, standard_
 from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
-from rigidmd.io.table import Column, with_error
-from rigidmd.io.table import Table as ReportTable
-from rigidmd.io.write import nine_digits
+from rigidmd.io.write import Column, nine_digits, with_error
+from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
 from rigidmd.studies.sweep.folder import FIGURE, FINISHED, SEED, Manifest, describe_values, short_keys, value_name
 
