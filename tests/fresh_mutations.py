@@ -267,7 +267,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F38", "torque that turns with a body: along the scene's axes, not the principal ones",
-        "assemble/body_parts.py",
+        "assemble/body.py",
         "            force, torque = _rotated(force, axes.T), _rotated(torque, axes.T)",
         "            force, torque = _rotated(force, axes.T), torque",
         ("test_body_engine.py::test_wheels_drives_and_friction_in_a_turning_accelerated_frame",),

@@ -249,7 +249,7 @@ RINGS = [
     ),
     Mutation(
         "B19", "OpenMM: the inverse of the friction of Langevin",
-        "engines/openmm/stages.py",
+        "engines/openmm/system.py",
         "mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)",
         "mm.LangevinMiddleIntegrator(stage.temperatures[0], 1 / stage.frictions[0], dt)",
         ("test_engine_settings.py::test_openmm_has_the_friction_of_langevin",),

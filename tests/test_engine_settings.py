@@ -366,7 +366,7 @@ MIRROR = """
 import numpy as np
 
 from PACKAGE.engines.external import ExternalEngine
-from PACKAGE.engines.translations import Key, Translations
+from PACKAGE.engines.external import Key, Translations
 
 TABLE = Translations("Mirror", (), (Key("thermostat", {None: "", "langevin": ""}),), (), ())
 

@@ -1,27 +1,29 @@
 """The system of a scene of molecules: species, model, start, terms. All errors are collected and raised together."""
 
 from dataclasses import replace
+from importlib import import_module
+from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.defaults import with_defaults, with_engine_defaults, with_momentum_removal
+from rigidmd.assemble.defaults import electrostatics_module, with_defaults, with_engine_defaults, with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
-from rigidmd.assemble.overlaps import overlaps
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
-from rigidmd.assemble.start import residue_numbers, set_momenta, starting_configuration
-from rigidmd.assemble.terms import field_terms, interactions, left_out, wrapped_between_walls
+from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.momenta import conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
-from rigidmd.forces.neighbors.space import cell_of, space_of
-from rigidmd.forces.parts import Composition, SystemParts, sum_of_tails
+from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
+from rigidmd.forces.parts import Composition, Interactions, SystemParts, sum_of_tails
 from rigidmd.io.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.fields import field_notes
+from rigidmd.scene.fields import FIELDS, field_notes
+from rigidmd.scene.forces import POTENTIALS
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import missing_user_code
 
@@ -125,3 +127,76 @@ def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Mo
         index.astype(np.int32), mass, np.where(frozen, 0.0, 1 / mass), inertia, rotor.inverse_inertia,
         rotor if inertia.any() else NoRotor(),
     )  # fmt: skip
+
+
+def interactions(parts: SystemParts) -> Interactions:
+    """The interactions of a resolved scene. Raises SceneError."""
+    forces = parts.scene.forces
+    modules = [
+        import_module(f"rigidmd.forces.potentials.{key}") for key in POTENTIALS if getattr(forces, key) is not None
+    ]
+    if any(m.charges.any() for m in parts.species):
+        modules += [module for module in [electrostatics_module(forces)] if module is not None]
+    found = [module.interactions(parts) for module in modules]
+    return Interactions(
+        {name: term for part in found for name, term in part.terms.items()},
+        {name: value for part in found for name, value in part.constants.items()},
+        sum(part.pressure for part in found), sum_of_tails([part.tail for part in found if part.tail is not None]),
+        next((part.force_error for part in found if part.force_error is not None), None),
+        tuple(note for part in found for note in part.notes),
+    )  # fmt: skip
+
+
+def field_terms(parts: SystemParts) -> dict[str, NamedTuple]:
+    """The terms of a scene's fields, by name. Raises SceneError with all errors."""
+    faults: list[str] = []
+    terms: dict[str, NamedTuple] = {}
+    for name, (kind, entry, where) in parts.scene.fields.entries.items():
+        term = import_module(f"rigidmd.forces.fields.{kind.module}").term(parts, entry, where, faults)
+        if term is not None:
+            terms[name] = term
+    if not faults and parts.scene.run.remove_momentum_interval_ps and not conserved_momentum(parts.model, terms).any():
+        why = "fields or frozen molecules change all components of the total momentum; leave it out"
+        faults.append(f"run.remove_momentum_interval_ps: {why}")
+    if faults:
+        raise SceneError(parts.scene.source, faults)
+    return terms
+
+
+def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndarray) -> np.ndarray:
+    """Positions (n, 3) wrapped to between the walls; unchanged without walls or box."""
+    if not isinstance(space, Orthorhombic):
+        return position
+    moved = position.copy()
+    for axis, edge in enumerate(space.edges):
+        if (bounds := scene.fields.bounds(axis)) is not None:
+            moved[:, axis] -= edge * np.rint((moved[:, axis] - sum(bounds) / 2) / edge)
+    return moved
+
+
+def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
+    """What is not compiled for this scene, and why."""
+    forces, has_images = scene.forces, "coulomb_reciprocal" in terms
+    method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
+    no_charges = "electrostatics is none" if method == "none" else "no site has one"
+    reasons = {
+        f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
+        for key, (title, without) in POTENTIALS.items()
+    } | {
+        f"charges: {no_charges}": not has_charges,
+        f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_images,
+        "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": has_images and method == "ewald",
+        "rotation and torques: every molecule is a point": isinstance(model.rotor, NoRotor),
+        "periodic images: no box": space.volume == inf,
+        "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
+        "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
+        "removal of the total momentum: run.remove_momentum_interval_ps is false": (
+            scene.run.remove_momentum_interval_ps is False
+        ),
+        "tail correction: not requested": not forces.tail_correction,
+    }  # fmt: skip
+    fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]
+    return [
+        *(reason for reason, applies in reasons.items() if applies),
+        *([f"{', '.join(fields)}: not in [fields]"] if fields else []),
+    ]  # fmt: skip

@@ -5,13 +5,14 @@ a pilot run chooses; the number of threads, on which results do not depend; and 
 the same lattice replaces a cell with a large tilt (see `SceneWithDefaults.pme_grid`).
 """
 
+from importlib import import_module
 from math import inf
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from rigidmd.assemble.terms import electrostatics_module
 from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.forces.neighbors.space import Triclinic
 from rigidmd.forces.parts import Composition, Grid, Settings
@@ -117,6 +118,12 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     removed = not ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
+
+
+def electrostatics_module(forces: Forces) -> ModuleType | None:
+    """The module of `forces` with the method of electrostatics; None for electrostatics = "none"."""
+    name = ELECTROSTATICS[forces.electrostatics].module
+    return import_module(f"rigidmd.forces.{name}") if name else None
 
 
 def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[str, Any], list[str]]:

@@ -1,5 +1,6 @@
 """The starting configuration from a structure file: atoms become molecules of the scene, in its box."""
 
+# isort: skip_file
 from math import prod
 from pathlib import Path
 from typing import NamedTuple
@@ -14,16 +15,9 @@ from rigidmd.errors import StructureError
 from rigidmd.forces.ewald.k_vectors import SAME_BASIS
 from rigidmd.io.formats.atoms import SAME_MASS, Atoms
 from rigidmd.io.formats.cells import (
-    basis_of,
-    cell_error,
-    describe_basis,
-    describe_cell,
-    least_skewed_cell,
-    reduced_cell,
-    right_angled,
-    same_lattice,
+    basis_of, cell_error, describe_basis, describe_cell, least_skewed_cell, reduced_cell, right_angled, same_lattice,
     standard_rotation,
-)
+)  # fmt: skip
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none

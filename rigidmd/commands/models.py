@@ -59,7 +59,7 @@ def _models(options: argparse.Namespace) -> int:
 
 def _write_model(options: argparse.Namespace) -> int:
     """`models --from`."""
-    from rigidmd.assemble.model_from_geometry import model_from_geometry
+    from rigidmd.assemble.species import model_from_geometry
     from rigidmd.errors import MoleculeError
     from rigidmd.io.scene_file import write_model
     from rigidmd.io.write import check_target

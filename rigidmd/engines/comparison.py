@@ -54,9 +54,13 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
     for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
-        if len(ours.load[k]):
-            title, pair = f"rms {name} on a molecule", (ours.load[k], theirs.load[k])
-            lines.append(_of_bodies(title, unit, *pair, tolerance, plain, size, system))
+        if len(a := ours.load[k]):
+            loads = (a, theirs.load[k], theirs.load[k] - a)
+            rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in loads]
+            # the tolerance is relative to the rms, or to the energy of a body where it nearly vanishes
+            scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if k == 0 else 1.0))
+            values = (x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance))
+            lines.append(Comparison(f"rms {name} on a molecule", unit, *values))
     if np.isfinite(ours.pressure_bar) and np.isfinite(theirs.pressure_bar):
         a, b = (float(seen.virial.trace()) for seen in (ours, theirs))
         lines.append(_energy("virial", a, b, (plain + there.virial_tolerance) * max(size, virial) + 3 * ewald))
@@ -65,16 +69,6 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
 
 def _energy(name: str, here: float, there: float, tolerance: float) -> Comparison:
     return Comparison(name, "kJ/mol", *(x / KJ_PER_MOL for x in (here, there, abs(there - here), tolerance)))
-
-
-def _of_bodies(
-    name: str, unit: str, here: np.ndarray, there: np.ndarray, tolerance: float, plain: float, size: float,
-    system: System
-) -> Comparison:  # fmt: skip
-    """Rms over bodies. The tolerance is relative to it, or to the energy of a body where it nearly vanishes."""
-    rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (here, there, there - here)]
-    scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if "Å" in unit else 1.0))
-    return Comparison(name, unit, *(x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance)))
 
 
 def describe_comparison(lines: list[Comparison], there: str) -> str:

@@ -6,7 +6,7 @@ terms that rigidmd itself runs, so that mixing rules, special pairs and truncati
 """
 
 from math import inf
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,12 +19,16 @@ from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.forces.potentials.truncation import ForceShifted, SmoothlySwitched, Switched, Truncation
 from rigidmd.scene import MolecularScene
 
 #: Classes of the pair potentials and terms that the view describes.
 DESCRIBED = (LennardJones, ReactionField, DampedShiftedForce, ScreenedCoulomb, EwaldSum, Pme, Background)
-
-CoulombLaw = ReactionField | DampedShiftedForce | ScreenedCoulomb
+#: The switching function S of t = (r - start)/(cutoff - start), see `forces.potentials.truncation`.
+SWITCHES: dict[type, str] = {
+    Switched: "1-10*t^3+15*t^4-6*t^5",
+    SmoothlySwitched: "1-126*t^5+420*t^6-540*t^7+315*t^8-70*t^9",
+}
 
 
 class SiteKind(NamedTuple):
@@ -46,7 +50,7 @@ class ForceFieldView(NamedTuple):
     sigma: np.ndarray  # (kinds, kinds) Å
     epsilon: np.ndarray  # (kinds, kinds) u Å²/ps²; 0 where there is no Lennard-Jones force
     lennard_jones: LennardJones | None
-    coulomb: CoulombLaw | None
+    coulomb: ReactionField | DampedShiftedForce | ScreenedCoulomb | None
 
     @property
     def scene(self) -> MolecularScene:
@@ -164,3 +168,55 @@ def _pairs(kinds: list[int], law: LennardJones | None) -> tuple[np.ndarray, np.n
             c12, c6 = law.c12[one, other], law.c6[one, other]
             sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
     return sigma, epsilon
+
+
+# Pair potentials as formulas and tables of r, for engines that lack the potential with its truncation. Formulas are in
+# the syntax of Lepton, OpenMM's parser: x^2, max, erfc, and definitions after semicolons.
+
+
+def lennard_jones_formula(potential: LennardJones, c12: float, c6: float, unit: float) -> str:
+    """Energy of two sites with c12/r¹² - c6/r⁶, r in Å, in units of `unit` u Å²/ps²."""
+    twelve, six = float(c12 / unit), float(c6 / unit)
+    end = tuple(twelve * of12 - six * of6 for of12, of6 in zip(potential.terms12, potential.terms6, strict=True))
+    return _truncated(f"{twelve!r}/r^12-{six!r}/r^6", potential.truncation, end)
+
+
+def coulomb_formula(potential: ReactionField | DampedShiftedForce, strength: float) -> str:
+    """Energy of two charges that is strength/r without truncation, r in Å."""
+    strength = float(strength)
+    if isinstance(potential, DampedShiftedForce):
+        return f"{strength!r}*(erfc({potential.alpha!r}*r)/r+{float(potential.slope)!r}*r+({float(potential.shift)!r}))"
+    end = tuple(strength * part for part in potential.terms)
+    return _truncated(f"{strength!r}/r+({strength * potential.field!r})*r^2", potential.truncation, end)
+
+
+def _truncated(formula: str, truncation: Truncation, end: tuple[float, ...]) -> str:
+    """A formula with a truncation and its terms, see `forces.potentials.truncation`."""
+    constant, linear, quadratic, cubic = (float(part) for part in end)
+    whole = f"{formula}+({constant!r})" if constant else formula
+    if isinstance(truncation, ForceShifted):
+        added = f"x*({linear!r})+x^3*({quadratic / 3!r})+x^4*({cubic / 4!r})"
+        return f"{whole}-({added}); x=max(0,r-{float(truncation.start)!r})"
+    if isinstance(truncation, Switched | SmoothlySwitched):
+        width = float(truncation.cutoff - truncation.start)
+        return f"({whole})*({SWITCHES[type(truncation)]}); t=max(0,(r-{float(truncation.start)!r})/{width!r})"
+    return whole
+
+
+def table(formula: str, first: float, last: float, entries: int) -> str:
+    """A table for LAMMPS' pair style `table`, even in r² from `first` to `last` Å: number, r, energy, force."""
+    import sympy  # slow to import
+
+    r = sympy.Symbol("r", positive=True)
+    text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
+    names: dict[str, Any] = {"r": r, "max": sympy.Max}
+    for definition in reversed(definitions):
+        name, _, value = definition.partition("=")
+        names[name] = sympy.parse_expr(value, names)
+    energy = sympy.parse_expr(text, names)
+    x = np.sqrt(np.linspace(first**2, last**2, entries))
+    with np.errstate(all="ignore"):
+        columns = [sympy.lambdify(r, y, ["numpy", "scipy"])(x) for y in (energy, -sympy.diff(energy, r))]
+    rows = zip(x, *(np.broadcast_to(column, x.shape) for column in columns), strict=True)
+    head = f"N {entries} RSQ {first:.17g} {last:.17g}\n\n"
+    return head + "".join(f"{k} {x:.15g} {u:.15g} {f:.15g}\n" for k, (x, u, f) in enumerate(rows, 1))

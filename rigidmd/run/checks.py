@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.overlaps import OVERLAP, close_pairs, every_site
+from rigidmd.assemble.start import OVERLAP, close_pairs, every_site
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.model import Model
@@ -23,8 +23,9 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.scene.limits import BodyWatch, Watch
+from rigidmd.scene.body import BodyWatch
 from rigidmd.scene.models import Molecule
+from rigidmd.scene.molecules import Watch
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL

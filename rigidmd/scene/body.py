@@ -22,8 +22,10 @@ from rigidmd.scene.body_forces import (
     Applied, ChangingInertia, Fluid, Frame, Friction, Gravity, NonNegativeVector, PositiveVector, Wheel,
 )  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme
-from rigidmd.scene.limits import BodyWatch
-from rigidmd.scene.validation import MOST_TABLES, Flag, NameIn, Number, Positive, Section, Vector, location_of
+from rigidmd.scene.validation import (
+    MOST_TABLES, Flag, Limit, NameIn, Number, Positive, Section, Vector, location_of,
+)  # fmt: skip
+
 
 Matrix = tuple[Vector, Vector, Vector]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -316,6 +318,20 @@ class BodyOutput(Section):
         if self.axis is not None and not any(self.axis):
             raise ValueError("axis is zero, which is not a direction")
         return self
+
+
+class BodyWatch(Section):
+    """Limits beyond which a run of a single body stops; false switches a check off."""
+
+    energy: Limit = 1.0
+    """Largest change of the energy less the work done, in units of the largest energy exchanged so far: the kinetic
+    energy at the start and changes of potential energy and work"""
+    orthogonality: Limit | None = None
+    """Largest entry of abs(QᵀQ - 1); default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not preserve it"""
+    turn_rad: Limit = False
+    """Largest rotation of the body in a step"""
+    stable_step: Flag = True
+    """Estimate the longest stable step from the body's spin and swing, and warn if timestep_s is longer"""
 
 
 class BodyScene(Scene):

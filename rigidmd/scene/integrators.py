@@ -1,21 +1,14 @@
 """Integrators of users as rows of coefficients, in the tables [[integrators]] of a scene or by `integrator`."""
 
+# isort: skip_file
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
 from rigidmd.core.integrators import (
-    AUTO,
-    SCHEMES,
-    SOLVERS,
-    WITH_THERMOSTAT,
-    Rotor,
-    Scheme,
-    composed,
-    measured_order,
-    split,
-)
+    AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, Scheme, composed, measured_order, split,
+)  # fmt: skip
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import SceneError
 from rigidmd.scene.validation import Line, Section, validation_messages

@@ -14,12 +14,10 @@ from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
-from rigidmd.scene.limits import Watch
 from rigidmd.scene.models import SIZES
-from rigidmd.scene.species import SPECIES_FILES, Molecules
+from rigidmd.scene.species import SPECIES_FILES, Box, Molecules, Start, Structure
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.start import Box, Start, Structure
-from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Section
+from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Limit, Section
 
 
 class UserCode(NamedTuple):
@@ -125,6 +123,27 @@ class Output(Section):
     @property
     def can_store_velocities(self) -> bool:
         return bool(self.trajectory) and BY_EXTENSION[Path(self.trajectory).suffix].velocities
+
+
+class Watch(Section):
+    """Limits beyond which a run stops, relative to scales of the system; false switches a check off."""
+
+    move: Limit = 0.25
+    """Largest displacement of a molecule between two evaluations of its forces, in units of the smallest site
+    diameter"""
+    turn_rad: Limit = 2.0
+    """Largest rotation of a molecule between two evaluations of its forces"""
+    kick: Limit = 20.0
+    """Largest change of a momentum by one kick, in units of the thermal momentum"""
+    energy: Limit = 0.5
+    """Largest change of the conserved energy, in units of the kinetic energy: in an nve stage, and within each
+    thermostat_time_ps of an nvt stage"""
+    volume: Limit = 8.0
+    """Largest volume of the box under a barostat, in units of the volume at the start"""
+    orthogonality: Limit = 1e-9
+    """Largest entry of abs(QᵀQ - 1)"""
+    stable_step: Flag = True
+    """Estimate the longest stable time step at the start of each stage, and warn if timestep_fs is longer"""
 
 
 class Settings(TypedDict, total=False):

@@ -1,19 +1,13 @@
 """The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a minimisation."""
 
+# isort: skip_file
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, auto_errors
 from rigidmd.scene.couplings import (
-    BAROSTAT_TIME,
-    BAROSTATS,
-    COMPRESSIBILITY,
-    DEFAULT_THERMOSTAT,
-    THERMOSTATS,
-    BarostatKeys,
-    Six,
-    ThermostatKeys,
+    BAROSTAT_TIME, BAROSTATS, COMPRESSIBILITY, DEFAULT_THERMOSTAT, THERMOSTATS, BarostatKeys, Six, ThermostatKeys,
     Values,
 )  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from rigidmd.assemble.build import build
 from rigidmd.core.files import writing
 from rigidmd.core.state import State
+from rigidmd.engines.external import checked_view
 from rigidmd.engines.registry import programs
 from rigidmd.engines.system import System
-from rigidmd.engines.translations import checked_view
 from rigidmd.errors import SceneError
 from rigidmd.io.folder import SCENE, check_folder, check_names, write_marker, written_by_runs
 from rigidmd.io.scene_file import input_names, write_scene

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.body_parts import inertia_at_centre, inertia_of, principal
+from rigidmd.assemble.body import inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.mechanics.rotation import unit_vector

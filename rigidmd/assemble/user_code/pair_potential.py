@@ -1,5 +1,6 @@
 """Pair potentials of users: the sites that they act on, their parameters and their cutoff schemes."""
 
+# isort: skip_file
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,21 +16,10 @@ from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, sites_named
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
-    DISTANCE,
-    LEAST_ROWS,
-    Formula,
-    FormulaError,
-    formula_of_function,
-    formula_of_table,
-    formula_of_text,
+    DISTANCE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table, formula_of_text,
 )  # fmt: skip
 from rigidmd.forces.potentials.truncation import (
-    MINIMUM_TOLERANCE,
-    TRUNCATIONS,
-    TruncationName,
-    default_switch_start,
-    short_cutoff_note,
-    truncation_of,
+    MINIMUM_TOLERANCE, TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
     truncation_terms,
 )  # fmt: skip
 from rigidmd.scene.models import Molecule

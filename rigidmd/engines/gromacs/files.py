@@ -16,8 +16,7 @@ from rigidmd.core.plain_text import as_word, distinct, in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.gromacs.translations import TRANSLATIONS, gromacs_points
-from rigidmd.engines.mass_points import MassPoints
-from rigidmd.engines.rigid_bodies import Points, RigidBodies
+from rigidmd.engines.rigid_bodies import MassPoints, Points, RigidBodies
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField

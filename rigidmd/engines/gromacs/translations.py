@@ -4,9 +4,9 @@ from math import inf
 
 import numpy as np
 
+from rigidmd.engines.external import SPLIT, Key, Limit, Missing, Translations, moves
 from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.mass_points import SAME, MassPoints, mass_points
-from rigidmd.engines.translations import SPLIT, Key, Limit, Missing, Translations, moves
+from rigidmd.engines.rigid_bodies import SAME, MassPoints, mass_points
 from rigidmd.scene.models import Molecule
 
 

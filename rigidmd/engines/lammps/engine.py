@@ -8,6 +8,7 @@ import contextlib
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -21,7 +22,6 @@ from rigidmd.core.state import HEAT, NOW, ORIGIN, Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.lammps import files
-from rigidmd.engines.lammps.dump import read_dump
 from rigidmd.engines.lammps.options import PROGRAM
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
@@ -30,6 +30,7 @@ from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce
+from rigidmd.io.formats.lammps import box_in_bounds
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
 from rigidmd.scene.validation import not_none
 
@@ -244,3 +245,53 @@ def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.Tem
             pipe.close()
     process.wait()
     folder.cleanup()
+
+
+MAGIC = b"DUMPCUSTOM"
+
+
+class Dump(NamedTuple):
+    step: int
+    low: np.ndarray  # (3,) of the box, Å
+    cell: np.ndarray  # (3, 3) rows a, b, c
+    rows: np.ndarray  # (s, columns) sorted by the first column
+
+
+def read_dump(path: Path) -> Dump:
+    """The first frame of a dump whose first column is the number of the atom. Raises EngineError."""
+    data = path.read_bytes()
+    at = 0
+
+    def take(form: str) -> tuple:
+        nonlocal at
+        found = struct.unpack_from(f"<{form}", data, at)
+        at += struct.calcsize(f"<{form}")
+        return found
+
+    try:
+        (mark,) = take("q")  # below zero: the length of the name that follows
+        if take(f"{max(-mark, 0)}s") != (MAGIC,):
+            raise ValueError("not a file of `dump custom`")
+        take("ii")  # byte order, revision
+        step, _, slanted = take("qqi")
+        take("6i")  # kinds of boundaries
+        xlo, xhi, ylo, yhi, zlo, zhi = take("6d")
+        xy, xz, yz = take("3d") if slanted else (0.0, 0.0, 0.0)
+        (columns,) = take("i")
+        (units,) = take("i")
+        take(f"{units}s")
+        if take("c") != (b"\0",):
+            take("d")  # time
+        (words,) = take("i")
+        take(f"{words}s")
+        (pieces,) = take("i")
+        rows = []
+        for _ in range(pieces):
+            (count,) = take("i")
+            rows.append(np.frombuffer(data, np.float64, count, at).reshape(-1, columns))
+            at += 8 * count
+    except (struct.error, ValueError) as error:
+        raise EngineError(f"LAMMPS wrote a dump that cannot be read: {error}") from None
+    low, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
+    table = np.concatenate(rows)
+    return Dump(step, low, cell, table[table[:, 0].argsort()])

@@ -11,8 +11,7 @@ import numpy as np
 from rigidmd.core.files import write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
-from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula, table
-from rigidmd.engines.force_field import ForceFieldView
+from rigidmd.engines.force_field import ForceFieldView, coulomb_formula, lennard_jones_formula, table
 from rigidmd.engines.lammps.translations import TRANSLATIONS
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Unmodified

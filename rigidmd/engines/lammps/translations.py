@@ -1,6 +1,6 @@
 """What LAMMPS can express, and how."""
 
-from rigidmd.engines.translations import SPLIT, Key, Limit, Translations, is_langevin, moves
+from rigidmd.engines.external import SPLIT, Key, Limit, Translations, is_langevin, moves
 
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 _BAROSTAT = "LAMMPS has its own for rigid bodies; leave barostat out"

@@ -5,6 +5,7 @@ term by term, so that observations leave no trace in the motion. OpenMM has no v
 energies at scaled centres of mass.
 """
 
+# isort: skip_file
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from rigidmd.core.state import HEAT, Load, State
 from rigidmd.engines.external import ExternalEngine, same_state
 from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.openmm.options import FIXED_PRECISIONS, PLATFORMS, precision_of
-from rigidmd.engines.openmm.stages import TOLERANCES, extra_forces, integration_groups, integrator_of, step
-from rigidmd.engines.openmm.system import NM, Group, layout, library, openmm_system
+from rigidmd.engines.openmm.system import (
+    NM, TOLERANCES, Group, extra_forces, integration_groups, integrator_of, layout, library, openmm_system, step,
+)  # fmt: skip
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
@@ -169,7 +171,7 @@ class OpenmmEngine(ExternalEngine):
         time."""
         if self.conserves_energy:
             return 0.0
-        groups = integration_groups(self._particles.view, self._stage)
+        groups = integration_groups(self._stage)
         energy = self._moving_context.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
         return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
 

@@ -1,5 +1,6 @@
 """Export to OpenMM: a folder with system, integrators and state as XML, and a script that runs the stages."""
 
+# isort: skip_file
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,8 +9,9 @@ from rigidmd.core.files import atomic_file, write_text
 from rigidmd.core.plain_text import in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.openmm.stages import KICK, MOVES, TOLERANCES, extra_forces, integrator_of
-from rigidmd.engines.openmm.system import NM, Layout, layout, library, openmm_system
+from rigidmd.engines.openmm.system import (
+    KICK, MOVES, NM, TOLERANCES, Layout, extra_forces, integrator_of, layout, library, openmm_system,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from openmm.app import Topology

@@ -5,24 +5,23 @@ are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
 """
 
 import re
-from math import inf
+from math import inf, pi
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.special import erfc
 
 from rigidmd.core.state import State
-from rigidmd.engines.expressions import coulomb_formula, lennard_jones_formula
-from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.mass_points import MassPoints, mass_points
+from rigidmd.engines.force_field import ForceFieldView, coulomb_formula, lennard_jones_formula
 from rigidmd.engines.openmm.options import PROGRAM
 from rigidmd.engines.openmm.translations import PME_ORDER, grid_for
-from rigidmd.engines.rigid_bodies import Points, RigidBodies
+from rigidmd.engines.rigid_bodies import MassPoints, Points, RigidBodies, mass_points
 from rigidmd.errors import EngineError
 from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Switched, Unmodified
+from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -129,22 +128,22 @@ def openmm_system(particles: Layout, cell: np.ndarray, separate: bool) -> "openm
         for i, j, distance in body.distances:
             made.addConstraint(where[i], where[j], distance * NM)
         for k, site in body.virtual_sites.items():
-            made.setVirtualSite(int(a) + k, _openmm_virtual_site(mm, where, site.weight.tolist(), site.cross))
+            made.setVirtualSite(int(a) + k, _openmm_virtual_site(where, site.weight.tolist(), site.cross))
     excluded = particles.excluded()
-    for force, group in _forces(mm, view, particles, separate):
+    for force, group in _forces(particles, separate):
         force.setForceGroup(group)
-        add = force.addException if isinstance(force, mm.NonbondedForce) else None
         for i, j in excluded if group != Group.TAIL else []:
-            if add is None:
-                force.addExclusion(i, j)
+            if isinstance(force, mm.NonbondedForce):
+                force.addException(i, j, 0.0, 1.0, 0.0)
             else:
-                add(i, j, 0.0, 1.0, 0.0)
+                force.addExclusion(i, j)
         made.addForce(force)
     return made
 
 
-def _openmm_virtual_site(mm: Any, points: list[int], weight: list[float], cross: float):
+def _openmm_virtual_site(points: list[int], weight: list[float], cross: float) -> Any:
     """The virtual site at the sum of weight times point."""
+    mm = library()
     if len(points) == 2:
         return mm.TwoParticleAverageSite(*points, *weight)
     if cross:
@@ -155,67 +154,59 @@ def _openmm_virtual_site(mm: Any, points: list[int], weight: list[float], cross:
     return mm.LocalCoordinatesSite(points, weight, [-1, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0])
 
 
-def _forces(mm: Any, view: ForceFieldView, particles: Layout, separate: bool) -> list[tuple]:
-    found, law, coulomb = [], view.lennard_jones, view.coulomb
-    plain = _builtin_lennard_jones(view)
+def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
+    """The forces of a system with their groups."""
+    found, view = [], particles.view
+    law, coulomb, plain = view.lennard_jones, view.coulomb, _builtin_lennard_jones(view)
     has_charge_force = isinstance(coulomb, ScreenedCoulomb) or (coulomb is not None and coulomb.cutoff == inf)
     together = plain is not None and has_charge_force and not separate
     if law is not None and view.epsilon.any():
         if plain is None:
-            found.append((_custom_lennard_jones(mm, view, particles), Group.LENNARD_JONES))
+            found.append((_custom_lennard_jones(particles), Group.LENNARD_JONES))
         elif not together:
-            force = _nonbonded(mm, view, particles, law.cutoff, np.zeros_like(view.charge), plain)
+            force = _nonbonded(particles, law.cutoff, np.zeros_like(view.charge), plain)
             found.append((force, Group.LENNARD_JONES))
         if view.is_periodic and isinstance(law.truncation, Unmodified) and view.truncation == "plain":
-            found.append((_custom_lennard_jones(mm, view, particles, step=True), Group.STEP_LENNARD_JONES))
+            found.append((_custom_lennard_jones(particles, step=True), Group.STEP_LENNARD_JONES))
     if coulomb is not None and has_charge_force:
-        force = _nonbonded(mm, view, particles, coulomb.cutoff, view.charge, plain if together else None)
+        force = _nonbonded(particles, coulomb.cutoff, view.charge, plain if together else None)
         found.append((force, Group.COULOMB_PAIRS))
         if isinstance(coulomb, ScreenedCoulomb):
-            force.setNonbondedMethod(mm.NonbondedForce.PME)
+            force.setNonbondedMethod(force.PME)
             force.setPMEParameters(float(coulomb.alpha) / NM, *(grid_for(view, PME_ORDER) or ()))
             force.setReciprocalSpaceForceGroup(Group.RECIPROCAL)
             height = f"{-float(erfc(coulomb.alpha * coulomb.cutoff)) / coulomb.cutoff!r}"
-            found.append((_custom_coulomb(mm, view, particles, height), Group.STEP_COULOMB))
+            found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
-        found.append((_custom_coulomb(mm, view, particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS))
+        found.append((_custom_coulomb(particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS))
         if view.is_periodic and not isinstance(coulomb, DampedShiftedForce) and view.truncation == "plain":
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
-            found.append((_custom_coulomb(mm, view, particles, height), Group.STEP_COULOMB))
+            found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
         energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
-        found.append((mm.CustomVolumeForce(f"{energy!r}/v"), Group.TAIL))
+        found.append((library().CustomVolumeForce(f"{energy!r}/v"), Group.TAIL))
     return found
 
 
 def _builtin_lennard_jones(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
-    """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in, else None."""
+    """sigma and epsilon of kinds if OpenMM has the Lennard-Jones potential of the scene built in, and those of all
+    pairs follow by Lorentz-Berthelot rules, else None."""
     law = view.lennard_jones
     if law is None or not (law.cutoff == inf or view.truncation in ("plain", "switch")):
         return None
-    return _lorentz_berthelot(view)
-
-
-def _lorentz_berthelot(view: ForceFieldView) -> tuple[np.ndarray, np.ndarray] | None:
-    """sigma and epsilon of kinds if all pairs follow from them by Lorentz-Berthelot rules, else None."""
     sigma, epsilon = view.sigma.diagonal(), view.epsilon.diagonal()
-    deep = view.epsilon > 0
     same = np.allclose(view.epsilon, np.sqrt(np.outer(epsilon, epsilon)), rtol=ROUNDING, atol=0)
     wide = np.isclose(view.sigma, (sigma[:, None] + sigma) / 2, rtol=ROUNDING, atol=0)
-    return (sigma, epsilon) if same and wide[deep].all() else None
+    return (sigma, epsilon) if same and wide[view.epsilon > 0].all() else None
 
 
 def _nonbonded(
-    mm: Any, view: ForceFieldView, particles: Layout, cutoff: float, charge: np.ndarray,
-    lennard_jones: tuple[np.ndarray, np.ndarray] | None
-):  # fmt: skip
+    particles: Layout, cutoff: float, charge: np.ndarray, lennard_jones: tuple[np.ndarray, np.ndarray] | None
+) -> Any:
     """A NonbondedForce between charges (s,) of sites, and with sigma and epsilon of kinds."""
-    force = mm.NonbondedForce()
+    view, rows = particles.view, np.zeros((len(particles.mass), 3))
+    force = _within(library().NonbondedForce(), view, cutoff)
     force.setUseDispersionCorrection(False)
-    force.setNonbondedMethod(_method(mm.NonbondedForce, view, cutoff))
-    if cutoff < inf:
-        force.setCutoffDistance(cutoff * NM)
-    rows = np.zeros((len(particles.mass), 3))
     rows[:, 1] = 1.0
     rows[particles.site, 0] = charge
     if lennard_jones is not None:
@@ -230,60 +221,140 @@ def _nonbonded(
     return force
 
 
-def _method(kind, view: ForceFieldView, cutoff: float) -> int:
-    if cutoff == inf:
-        return kind.NoCutoff
-    return kind.CutoffPeriodic if view.is_periodic else kind.CutoffNonPeriodic
-
-
-def _custom(
-    mm: Any, view: ForceFieldView, particles: Layout, cutoff: float, formula: str, values: dict[str, np.ndarray]
-):
-    """A CustomNonbondedForce with a formula of r in Å, and values (s,) of sites."""
-    text = re.sub(r"\br\b", "R", formula)
-    force = mm.CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
-    force.setNonbondedMethod(_method(mm.CustomNonbondedForce, view, cutoff))
+def _within(force: Any, view: ForceFieldView, cutoff: float) -> Any:
+    """The same force, within a cutoff (Å) unless it is infinite."""
     if cutoff < inf:
+        force.setNonbondedMethod(force.CutoffPeriodic if view.is_periodic else force.CutoffNonPeriodic)
         force.setCutoffDistance(cutoff * NM)
-    rows = np.zeros((len(particles.mass), len(values)))
-    for k, (name, of_sites) in enumerate(values.items()):
-        force.addPerParticleParameter(name)
-        rows[particles.site, k] = of_sites
-    for row in rows.tolist():
-        force.addParticle(row)
     return force
 
 
-def _custom_lennard_jones(mm: Any, view: ForceFieldView, particles: Layout, step: bool = False):
+def _custom(particles: Layout, cutoff: float, formula: str, name: str, of_sites: np.ndarray) -> Any:
+    """A CustomNonbondedForce with a formula of r in Å, and named values (s,) of sites."""
+    text = re.sub(r"\br\b", "R", formula)
+    force = library().CustomNonbondedForce(f"{text}; R={1 / NM!r}*r" if text != formula else text)
+    force.addPerParticleParameter(name)
+    values = np.zeros(len(particles.mass))
+    values[particles.site] = of_sites
+    for value in values.tolist():
+        force.addParticle([value])
+    return _within(force, particles.view, cutoff)
+
+
+def _custom_lennard_jones(particles: Layout, step: bool = False) -> Any:
     """The Lennard-Jones potential as a formula, or its step at the cutoff; linear in c12 and c6, from tables of kinds.
     Kind 0 is for mass points without a site."""
-    law = view.lennard_jones
-    assert isinstance(law, LennardJones)
+    view = particles.view
+    law = not_none(view.lennard_jones)
     if step:
         formula = f"c6*{law.cutoff**-6!r}-c12*{law.cutoff**-12!r}"
     else:
         of12, of6 = (lennard_jones_formula(law, *c, 1.0).split(";", 1) for c in ((1.0, 0.0), (0.0, 1.0)))
         definitions = f";{of12[1]}" if len(of12) == 2 else ""
         formula = f"c12*({of12[0]})+c6*({of6[0]}){definitions}"
+    formula += "; c12=table12(kind1,kind2); c6=table6(kind1,kind2)"
+    force = _custom(particles, law.cutoff, formula, "kind", view.kind + 1)
     six = view.sigma**6
     c6 = 4 * view.epsilon * six / KJ_PER_MOL
-    force = _custom(
-        mm, view, particles, law.cutoff,
-        f"{formula}; c12=table12(kind1,kind2); c6=table6(kind1,kind2)", {"kind": view.kind + 1},
-    )  # fmt: skip
-    size = len(c6) + 1
     for name, table in (("table12", c6 * six), ("table6", c6)):
-        padded = np.zeros((size, size))
-        padded[1:, 1:] = table
-        force.addTabulatedFunction(name, mm.Discrete2DFunction(size, size, padded.ravel().tolist()))
+        padded = np.pad(table, ((1, 0), (1, 0)))
+        force.addTabulatedFunction(name, library().Discrete2DFunction(*padded.shape, padded.ravel().tolist()))
     return force
 
 
-def _custom_coulomb(mm: Any, view: ForceFieldView, particles: Layout, formula: str):
+def _custom_coulomb(particles: Layout, formula: str) -> Any:
     """q q times a formula of unit strength. Charges are in units in which q q/r is in kJ/mol."""
-    law = view.coulomb
-    assert law is not None
     main, *definitions = formula.split(";", 1)
-    charge = view.charge * np.sqrt(COULOMB / KJ_PER_MOL)
+    charge = particles.view.charge * np.sqrt(COULOMB / KJ_PER_MOL)
     text = "; ".join([f"q1*q2*({main})", *definitions])
-    return _custom(mm, view, particles, law.cutoff, text, {"q": charge})
+    return _custom(particles, not_none(particles.view.coulomb).cutoff, text, "q", charge)
+
+
+#: Variables of the velocity Verlet integrator: fraction of a kick, and whether positions move.
+KICK, MOVES = "kick", "moves"
+#: One more than the largest seed. OpenMM chooses a seed itself for 0.
+SEEDS = 2**31 - 1
+#: Interval, in steps, of a removal of momentum that never happens.
+NEVER = 2**31 - 1
+#: Relative tolerance of constrained distances by precision, which is double on the platforms Reference and CPU.
+TOLERANCES = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
+
+
+def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> Any:
+    """The integrator of stage k. A minimisation gets velocity Verlet."""
+    mm, stage = library(), view.system.scene.stages[k]
+    dt = stage.timestep_fs * 1e-3
+    if stage.thermostat_kind == "langevin":
+        made = mm.LangevinMiddleIntegrator(stage.temperatures[0], stage.frictions[0], dt)
+        made.setRandomNumberSeed(_seed(view, k))
+    elif stage.thermostat_kind == "nose_hoover":
+        # OpenMM has the angular frequency of a chain, a scene its period
+        made = mm.NoseHooverIntegrator(
+            stage.temperatures[0], 2 * pi / stage.thermostat_time, dt, stage.nose_hoover_links
+        )
+    else:
+        made = _velocity_verlet(dt)
+    made.setConstraintTolerance(distance_tolerance)
+    made.setIntegrationForceGroups(integration_groups(stage))
+    return made
+
+
+def _velocity_verlet(dt: float) -> Any:
+    """Velocity Verlet with constrained distances, to be stepped by `step`.
+
+    Leapfrog steps with half a kick at either end give the same positions and velocities (RATTLE; Andersen 1983, J.
+    Comput. Phys. 52, 24) without forces within a step, where OpenMM has not yet computed the virtual sites.
+    """
+    made = library().CustomIntegrator(dt)
+    made.addGlobalVariable(KICK, 1.0)
+    made.addGlobalVariable(MOVES, 1.0)
+    made.addPerDofVariable("x1", 0)
+    made.addComputePerDof("v", f"v+{KICK}*dt*f/m")
+    made.beginIfBlock(f"{MOVES} = 1")
+    made.addComputePerDof("x", "x+dt*v")
+    made.addComputePerDof("x1", "x")
+    made.addConstrainPositions()
+    made.addComputePerDof("v", "v+(x-x1)/dt")
+    made.endBlock()
+    made.beginIfBlock(f"{MOVES} = 0")
+    made.addConstrainVelocities()
+    made.endBlock()
+    return made
+
+
+def step(integrator: Any, steps: int) -> None:
+    """Take steps. Velocity Verlet begins and ends with half a kick."""
+    if not hasattr(integrator, "setGlobalVariableByName"):
+        integrator.step(steps)
+        return
+    for kick, moves, count in ((0.5, 1, 1), (1.0, 1, steps - 1), (0.5, 0, 1)):
+        integrator.setGlobalVariableByName(KICK, kick)
+        integrator.setGlobalVariableByName(MOVES, moves)
+        integrator.step(count)
+
+
+def integration_groups(stage: Stage) -> set[int]:
+    """The force groups that move a stage: those with forces, and energies that a barostat needs in addition."""
+    groups = {Group.LENNARD_JONES, Group.COULOMB_PAIRS, Group.RECIPROCAL}
+    if stage.has_barostat:
+        # it compares energies; the pressure agrees with the forces if energies are continuous
+        groups |= {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB, Group.TAIL}
+    return groups
+
+
+def extra_forces(view: ForceFieldView, k: int) -> list:
+    """The forces of stage k in addition to its integrator: a barostat, and a remover of momentum that makes OpenMM
+    subtract the degrees of freedom of the total momentum."""
+    mm, stage, system = library(), view.system.scene.stages[k], view.system
+    found = []
+    if stage.thermostat_kind == "nose_hoover" and system.freedom_in(k).translation < 3 * int((~view.frozen).sum()):
+        found.append(mm.CMMotionRemover(NEVER))
+    if stage.has_barostat:
+        barostat = mm.MonteCarloBarostat(stage.pressures[0][0], stage.temperatures[0], stage.moves_every)
+        barostat.setRandomNumberSeed(_seed(view, k) % (SEEDS - 1) + 1)
+        found.append(barostat)
+    return found
+
+
+def _seed(view: ForceFieldView, k: int) -> int:
+    return (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1

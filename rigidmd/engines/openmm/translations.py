@@ -4,8 +4,8 @@ from math import inf, sqrt
 
 import numpy as np
 
+from rigidmd.engines.external import SPLIT, Key, Limit, Missing, Translations, moves
 from rigidmd.engines.force_field import ForceFieldView
-from rigidmd.engines.translations import SPLIT, Key, Limit, Missing, Translations, moves
 from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.space import cell_of
