@@ -173,11 +173,12 @@ def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) ->
     if frozen:
         return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
     mass, position, site = _points(molecule, sites)
-    others = [k for k in range(len(molecule.masses)) if k not in site]
-    limit = OFF * molecule.radius
-    return MassPoints(
-        mass, position, site, {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
-    )
+    virtual = {
+        k: _virtual_site(position, where, OFF * molecule.radius)
+        for k, where in enumerate(molecule.positions_body)
+        if k not in site
+    }
+    return MassPoints(mass, position, site, virtual)
 
 
 def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -219,11 +220,10 @@ def _can_be_points(molecule: Molecule, heavy: np.ndarray) -> bool:
 def _virtual_site(points: np.ndarray, where: np.ndarray, limit: float) -> VirtualSite:
     if len(points) == 1:
         return VirtualSite(np.ones(1), 0.0)
-    edges = (points[1:] - points[0]).T
-    weight = np.linalg.lstsq(edges, where - points[0], rcond=None)[0]
-    cross = 0.0
+    weight, cross = np.linalg.lstsq((points[1:] - points[0]).T, where - points[0], rcond=None)[0], 0.0
     if len(points) == 3:
         normal = np.cross(points[1] - points[0], points[2] - points[0])
-        height = float((where - points[0]) @ normal) / float(np.linalg.norm(normal))
-        cross = height / float(np.linalg.norm(normal)) if abs(height) > limit else 0.0
+        length = float(np.linalg.norm(normal))
+        height = float((where - points[0]) @ normal) / length
+        cross = height / length if abs(height) > limit else 0.0
     return VirtualSite(np.append(1 - weight.sum(), weight), cross)

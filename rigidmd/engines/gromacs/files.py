@@ -39,26 +39,21 @@ def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]
     bodies = [gromacs_points(m) for m in view.system.species]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
     names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
+    script = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
+    before = f"-c {COORDINATES}"
+    for name in map(quote, names):
+        script += [f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"]
+        script += [f'gmx mdrun -deffnm {name} "$@"']
+        before = f"-c {name}.gro -t {name}.cpt"
     text = {
         COORDINATES: _coordinates(view, bodies, state), TOPOLOGY: _topology(view, bodies),
         **{f"{name}.mdp": _settings(view, k) for name, (k, _) in zip(names, stages, strict=True)},
-        SCRIPT: _script(names),
+        SCRIPT: "\n".join([*script, ""]),
     }  # fmt: skip
     for name, content in text.items():
         write_text(folder / name, content)
     (folder / SCRIPT).chmod(0o755)
     return list(text)
-
-
-def _script(names: list[str]) -> str:
-    lines = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
-    before = f"-c {COORDINATES}"
-    for name in names:
-        name = quote(name)
-        lines += [f"gmx grompp -f {name}.mdp {before} -p {TOPOLOGY} -po {name}_all.mdp -o {name}.tpr"]
-        lines += [f'gmx mdrun -deffnm {name} "$@"']
-        before = f"-c {name}.gro -t {name}.cpt"
-    return "\n".join(lines) + "\n"
 
 
 def _extra_points(molecule: Molecule, body: MassPoints) -> int:
@@ -188,17 +183,15 @@ def _settings(view: ForceFieldView, k: int) -> str:
 
 def _coulomb(view: ForceFieldView) -> dict[str, object]:
     law, mesh = view.coulomb, view.system.terms.get("coulomb_reciprocal")
-    coulomb_type: dict[str, object] = {"coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]}
+    found: dict[str, object] = {"coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]}
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
-        return coulomb_type | {
-            "coulomb-modifier": "Potential-shift" if law.shift else "None",
-            "ewald-rtol": f"{float(erfc(law.alpha * law.cutoff)):.12g}",
-            **{f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)}, "pme-order": mesh.order,
-        }  # fmt: skip
-    if isinstance(law, ReactionField):
+        found["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
+        found["ewald-rtol"] = f"{float(erfc(law.alpha * law.cutoff)):.12g}"
+        found |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {"pme-order": mesh.order}
+    elif isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity
-        return coulomb_type | {"epsilon-rf": 0 if permittivity == inf else f"{permittivity:.12g}"}
-    return coulomb_type
+        found["epsilon-rf"] = 0 if permittivity == inf else f"{permittivity:.12g}"
+    return found
 
 
 def _couplings(stage: Stage) -> dict[str, object]:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import weakref
+from collections import deque
 from pathlib import Path
 from typing import IO, NamedTuple, cast
 
@@ -29,10 +30,9 @@ from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.forces.ewald.corrections import background, self_energy
-from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce
+from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
 from rigidmd.io.formats.lammps import box_in_bounds
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
-from rigidmd.scene.validation import not_none
 
 #: Begins a line with numbers, which also ends the output of a command.
 NUMBERS = "rigidmd:"
@@ -145,53 +145,42 @@ class LammpsEngine(ExternalEngine):
             f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
             f'print "{NUMBERS} {" ".join(f"$({name}:%.17g)" for name in names)}"',
         )
-        dump = read_dump(self._process.folder / DUMP)
-        if not (np.isfinite(dump.rows).all() and np.isfinite(figures).all()):
+        cell, rows = read_dump(self._process.folder / DUMP)
+        if not (np.isfinite(rows).all() and np.isfinite(figures).all()):
             raise NotFiniteError(state._replace(position=np.full_like(state.position, np.nan)))
-        cell = dump.cell if view.is_periodic else state.cell
-        position = dump.rows[:, 1:4] + (dump.rows[:, 4:7] @ cell if view.is_periodic else 0.0)
-        found = self._bodies.state(state, position, dump.rows[:, 7:10] * PER_PS, cell)
+        cell = cell if view.is_periodic else state.cell
+        position = rows[:, 1:4] + (rows[:, 4:7] @ cell if view.is_periodic else 0.0)
+        found = self._bodies.state(state, position, rows[:, 7:10] * PER_PS, cell)
         for mine, its in zip(state[:5], found[:5], strict=True):
             mine[:] = its
-        n, force = len(energies), dump.rows[:, 10:13] * files.KCAL
-        energy = np.array(figures[:n]) * files.KCAL
-        tallies = self._tallies(energy, self._virial(figures[n : n + 6], state.volume, position, force), state.volume)
+        n, force, virial = len(energies), rows[:, 10:13] * files.KCAL, np.zeros((3, 3))
+        if view.is_periodic:  # the symmetric part of the molecular virial, from the atomic virial as a pressure
+            xx, yy, zz, xy, xz, yz = np.array(figures[n : n + 6]) * files.ATMOSPHERE * state.volume
+            intramolecular = self._bodies.intramolecular_virial(position, force)
+            virial = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (intramolecular + intramolecular.T) / 2
+        tallies = self._tallies(np.array(figures[:n]) * files.KCAL, virial, state.volume)
         self._evaluated = self._bodies.load(state, position, force), tallies
         # the conserved energy that LAMMPS' fix rigid prints is not conserved: for 512 SPC/E under rigid/nvt it changed
         # by 1 % in 0.6 ps, at 0.5 fs as at 2 fs
-        if self.conserves_energy:
-            heat = 0.0
-        else:
+        heat = 0.0
+        if not self.conserves_energy:
             heat = sum(tally.energy for tally in tallies.values()) + sum(kinetic_energies(self._system, state))
         state.energy_ledger[HEAT] = self._heat_offset + heat
 
-    def _virial(self, pressure: list[float], volume: float, position: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """The symmetric part of the molecular virial (3, 3) from the atomic virial as a pressure xx yy zz xy xz yz."""
-        if not self._view.is_periodic:
-            return np.zeros((3, 3))
-        xx, yy, zz, xy, xz, yz = np.array(pressure) * files.ATMOSPHERE * volume
-        intramolecular = self._bodies.intramolecular_virial(position, force)
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - (intramolecular + intramolecular.T) / 2
-
     def _tallies(self, energy: np.ndarray, virial: np.ndarray, volume: float) -> dict[str, Tally]:
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
-        view, found = self._view, {}
+        view = self._view
         charge = view.charge * np.sqrt(files.COULOMB_REAL * files.KCAL)  # with LAMMPS' constant
-        names = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None))
-        if view.has_ewald_sum:
-            alpha = not_none(view.system.scene.forces.ewald_alpha_per_A)
-            even = background(float(charge.sum()) ** 2, alpha).strength / volume
-            found = dict(zip([*names, "coulomb_real", "coulomb_reciprocal"], energy, strict=True))
-            found["coulomb_reciprocal"] -= self_energy(charge, alpha) + even
+        names, law = ["lennard_jones"] * (len(self._styles) - (view.coulomb is not None)), view.coulomb
+        names += ["coulomb_real", "coulomb_reciprocal"] if view.has_ewald_sum else ["coulomb"] * (law is not None)
+        found = dict(zip(names, energy, strict=True))
+        if isinstance(law, ScreenedCoulomb):
+            even = background(float(charge.sum()) ** 2, law.alpha).strength / volume
+            found["coulomb_reciprocal"] -= self_energy(charge, law.alpha) + even
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
-        elif view.coulomb is not None:
-            found = dict(zip([*names, "coulomb"], energy, strict=True))
-            if isinstance(view.coulomb, DampedShiftedForce):
-                law = view.coulomb
-                found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
-        else:
-            found = dict(zip(names, energy, strict=True))
+        elif isinstance(law, DampedShiftedForce):
+            found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
         zero = np.zeros((3, 3))
         return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
 
@@ -202,7 +191,6 @@ class Process:
     def __init__(self, arguments: list[str]):
         self._folder_handle = tempfile.TemporaryDirectory(prefix="rigidmd-lammps-")
         self.folder = Path(self._folder_handle.name)
-        self._output: list[str] = []
         try:
             self._process = subprocess.Popen(
                 [*arguments, "-nonbuf", "-nocite", "-log", "none"], cwd=self.folder, text=True,
@@ -223,12 +211,12 @@ class Process:
         with contextlib.suppress(OSError):  # it has ended; its output shows why
             self._in.write(f"{text}\n")
             self._in.flush()
+        output: deque[str] = deque(maxlen=QUOTED_FROM)
         for line in self._out:
             if line.startswith(NUMBERS):
-                self._output.clear()
                 return [float(figure) for figure in line[len(NUMBERS) :].split()]
-            self._output = [*self._output[-QUOTED_FROM:], line.strip()]
-        messages = [line for line in self._output if "ERROR" in line] or [line for line in self._output if line][-3:]
+            output.append(line.strip())
+        messages = [line for line in output if "ERROR" in line] or [line for line in output if line][-3:]
         runs = any(line.startswith("run ") and line != "run 0" for line in lines)
         kind = SimulationError if runs else EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
@@ -247,18 +235,9 @@ def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.Tem
     folder.cleanup()
 
 
-MAGIC = b"DUMPCUSTOM"
-
-
-class Dump(NamedTuple):
-    step: int
-    low: np.ndarray  # (3,) of the box, Å
-    cell: np.ndarray  # (3, 3) rows a, b, c
-    rows: np.ndarray  # (s, columns) sorted by the first column
-
-
-def read_dump(path: Path) -> Dump:
-    """The first frame of a dump whose first column is the number of the atom. Raises EngineError."""
+def read_dump(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The first frame of a binary dump (`dump custom` to a file with extension .bin, in the format since 2020) whose
+    first column is the number of the atom: the cell (3, 3) and the rows, sorted by this column. Raises EngineError."""
     data = path.read_bytes()
     at = 0
 
@@ -270,15 +249,12 @@ def read_dump(path: Path) -> Dump:
 
     try:
         (mark,) = take("q")  # below zero: the length of the name that follows
-        if take(f"{max(-mark, 0)}s") != (MAGIC,):
+        if take(f"{max(-mark, 0)}s") != (b"DUMPCUSTOM",):
             raise ValueError("not a file of `dump custom`")
-        take("ii")  # byte order, revision
-        step, _, slanted = take("qqi")
-        take("6i")  # kinds of boundaries
-        xlo, xhi, ylo, yhi, zlo, zhi = take("6d")
+        *_, slanted = take("iiqqi")  # byte order, revision, step, number of atoms
+        xlo, xhi, ylo, yhi, zlo, zhi = take("6i6d")[6:]  # after the kinds of boundaries
         xy, xz, yz = take("3d") if slanted else (0.0, 0.0, 0.0)
-        (columns,) = take("i")
-        (units,) = take("i")
+        columns, units = take("ii")
         take(f"{units}s")
         if take("c") != (b"\0",):
             take("d")  # time
@@ -292,6 +268,6 @@ def read_dump(path: Path) -> Dump:
             at += 8 * count
     except (struct.error, ValueError) as error:
         raise EngineError(f"LAMMPS wrote a dump that cannot be read: {error}") from None
-    low, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
+    _, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
     table = np.concatenate(rows)
-    return Dump(step, low, cell, table[table[:, 0].argsort()])
+    return cell, table[table[:, 0].argsort()]

@@ -104,8 +104,9 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     lines += [style.modify for style in styles if style.modify]
     if view.has_ewald_sum:
         style = TRANSLATIONS.of("forces.electrostatics")[forces.electrostatics]
-        lines += [f"kspace_style {style} {accuracy(view):.3g}"]
-        lines += [f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
+        # LAMMPS' accuracy is the rms error of the force on a site over the force of two charges e at 1 Å
+        accuracy = float(system.force_error or 0.0) / COULOMB
+        lines += [f"kspace_style {style} {accuracy:.3g}", f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
     lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
     points = ~view.is_body & ~view.frozen
@@ -117,15 +118,6 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     return lines
 
 
-def accuracy(view: ForceFieldView) -> float:
-    """LAMMPS' accuracy of the Ewald sum: rms error of the force on a site over the force of two charges e at 1 Å."""
-    return float(view.system.force_error or 0.0) / COULOMB
-
-
-def _cutoff(cutoff: float) -> float:
-    return FARTHEST if cutoff == inf else cutoff
-
-
 def _ranges(numbers: Iterable[int]) -> str:
     """Numbers as 1:5 7 9:12."""
     found: list[list[int]] = []
@@ -135,6 +127,10 @@ def _ranges(numbers: Iterable[int]) -> str:
         else:
             found.append([int(number), int(number)])
     return " ".join(str(a) if a == b else f"{a}:{b}" for a, b in found)
+
+
+def _cutoff(cutoff: float) -> float:
+    return FARTHEST if cutoff == inf else cutoff
 
 
 def pair_styles(view: ForceFieldView) -> list[PairStyle]:
@@ -170,13 +166,13 @@ def _coulomb(view: ForceFieldView) -> PairStyle | None:
     charge = [kind.charge for kind in view.kinds]
     charged = [k for k, q in enumerate(charge) if q != 0]
     pairs = [(i, j) for i in charged for j in charged if i <= j]
-    cutoff = _num(_cutoff(law.cutoff))
+    cutoff, plain = _num(_cutoff(law.cutoff)), dict.fromkeys(pairs, "")
     if isinstance(law, ScreenedCoulomb):
-        return PairStyle("coul/long", cutoff, dict.fromkeys(pairs, ""), modify="pair_modify pair coul/long table 0")
+        return PairStyle("coul/long", cutoff, plain, modify="pair_modify pair coul/long table 0")
     if law.cutoff == inf:
-        return PairStyle("coul/cut", cutoff, dict.fromkeys(pairs, ""))
+        return PairStyle("coul/cut", cutoff, plain)
     if isinstance(law, DampedShiftedForce):
-        return PairStyle("coul/dsf", f"{_num(law.alpha)} {cutoff}", dict.fromkeys(pairs, ""))
+        return PairStyle("coul/dsf", f"{_num(law.alpha)} {cutoff}", plain)
     of_pairs = {(i, j): coulomb_formula(law, COULOMB_REAL * charge[i] * charge[j]) for i, j in pairs}
     return _tables("coulomb", of_pairs, cutoff)
 
@@ -211,50 +207,27 @@ def fixes(view: ForceFieldView, k: int) -> list[str]:
     """The fixes that move the molecules in stage k."""
     stage = view.system.scene.stages[k]
     seed = (view.system.scene.seed * 1000 + k) % (SEEDS - 1) + 1
-    lines = []
-    if view.is_body.any():
-        lines.append(f"fix {BODIES} {BODIES} {_fix_of_bodies(view, stage, seed)}")
+    kind, links = "nve" if stage.is_minimisation else stage.ensemble, stage.nose_hoover_links
+    at, langevin = " ".join(map(_num, stage.temperatures)), []
+    if stage.thermostat_kind == "langevin":
+        damping = f"{at} {_num(1e3 / stage.frictions[0])}"
+        of_bodies, of_points = f"rigid/small molecule langevin {damping} {seed}", "nve"
+        langevin = [f"fix {POINTS}_bath {POINTS} langevin {damping} {seed + 1} tally yes"]
+    else:
+        of_bodies, of_points = f"rigid/{kind}/small molecule", kind
+        if stage.has_thermostat:  # LAMMPS has the inverse of an angular frequency, a scene its period
+            chain = f" temp {at} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
+            of_bodies, of_points = of_bodies + chain, of_points + chain
+        if stage.has_barostat:
+            box = f" {_barostat(view, stage)}"
+            of_bodies, of_points = of_bodies + box, of_points + box
+        if stage.has_thermostat:
+            of_bodies += f" tparam {links} 1 5" + (f" pchain {links}" if stage.has_barostat else "")
+            of_points += "" if stage.has_barostat else f" tchain {links}"
+    lines = [f"fix {BODIES} {BODIES} {of_bodies}"] if view.is_body.any() else []
     if (~view.is_body & ~view.frozen).any():
-        lines += _fixes_of_points(view, stage, seed, alone=not view.is_body.any())
+        lines += [f"fix {POINTS} {POINTS} {of_points}", *langevin]
     return lines
-
-
-def _fix_of_bodies(view: ForceFieldView, stage: Stage, seed: int) -> str:
-    if stage.is_minimisation or stage.ensemble == "nve":
-        return "rigid/nve/small molecule"
-    if stage.thermostat_kind == "langevin":
-        return f"rigid/small molecule langevin {_langevin(stage, seed)}"
-    if stage.ensemble == "nph":
-        return f"rigid/nph/small molecule {_barostat(view, stage)}"
-    links = f"tparam {stage.nose_hoover_links} 1 5"
-    if stage.ensemble == "npt":
-        box = _barostat(view, stage)
-        return f"rigid/npt/small molecule {_nose_hoover(stage)} {box} {links} pchain {stage.nose_hoover_links}"
-    return f"rigid/nvt/small molecule {_nose_hoover(stage)} {links}"
-
-
-def _fixes_of_points(view: ForceFieldView, stage: Stage, seed: int, alone: bool) -> list[str]:
-    if stage.is_minimisation or stage.ensemble == "nve":
-        return [f"fix {POINTS} {POINTS} nve"]
-    if stage.thermostat_kind == "langevin":
-        langevin = f"fix {POINTS}_bath {POINTS} langevin {_langevin(stage, seed + 1)} tally yes"
-        return [f"fix {POINTS} {POINTS} nve", langevin]
-    if stage.has_barostat:
-        kind = "npt" if stage.has_thermostat else "nph"
-        thermostat = f"{_nose_hoover(stage)} " if stage.has_thermostat else ""
-        return [f"fix {POINTS} {POINTS} {kind} {thermostat}{_barostat(view, stage)}"]
-    return [f"fix {POINTS} {POINTS} nvt {_nose_hoover(stage)} tchain {stage.nose_hoover_links}"]
-
-
-def _nose_hoover(stage: Stage) -> str:
-    """Temperatures and damping time, fs. LAMMPS has the inverse of an angular frequency, a scene its period."""
-    first, last = stage.temperatures
-    return f"temp {_num(first)} {_num(last)} {_num(1e3 * stage.thermostat_time / (2 * pi))}"
-
-
-def _langevin(stage: Stage, seed: int) -> str:
-    first, last = stage.temperatures
-    return f"{_num(first)} {_num(last)} {_num(1e3 / stage.frictions[0])} {seed}"
 
 
 def _barostat(view: ForceFieldView, stage: Stage) -> str:
@@ -271,22 +244,17 @@ def _barostat(view: ForceFieldView, stage: Stage) -> str:
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
 
 
-def _thermo(view: ForceFieldView) -> list[str]:
-    columns = "step time temp pe ke etotal press vol density"
-    constant = view.system.constants.get("coulomb_intramolecular")
-    if constant is None:
-        return [f"thermo_style custom {columns}"]
-    note = "# pe includes pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
-    potential = f"variable potential equal pe+({_num(constant / KCAL)})"
-    return [note, potential, f"thermo_style custom {columns} v_potential"]
-
-
 def input_script(view: ForceFieldView) -> str:
     """The input script of the whole run: settings, and all stages except minimisations."""
     system, output = view.system, view.system.scene.output
     hint = "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
     lines = [f"# {in_comment(system.scene.in_short)}", hint, "", f"include {SETTINGS}", ""]
-    lines += [*_thermo(view), "thermo_modify format float %.10g flush yes"]
+    columns = "step time temp pe ke etotal press vol density"
+    if (constant := system.constants.get("coulomb_intramolecular")) is not None:
+        what = "pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
+        lines += [f"# pe includes {what}", f"variable potential equal pe+({_num(constant / KCAL)})"]
+        columns += " v_potential"
+    lines += [f"thermo_style custom {columns}", "thermo_modify format float %.10g flush yes"]
     for k, stage in enumerate(system.scene.stages):
         if stage.is_minimisation:
             continue

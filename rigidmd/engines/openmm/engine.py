@@ -35,23 +35,14 @@ STRAIN = {True: 2e-5, False: 5e-4}
 ERRORS = {"double": (0.0, 1e-4), "mixed": (2e-5, 1e-3), "single": (1e-4, 1e-2)}
 
 
-def platforms() -> list[str]:
-    """The platforms of OpenMM on this machine."""
+def _platforms() -> dict[str, Any]:
+    """Name -> platform of OpenMM on this machine."""
     kinds = library().Platform
-    return [kinds.getPlatform(k).getName() for k in range(kinds.getNumPlatforms())]
+    return {p.getName(): p for p in map(kinds.getPlatform, range(kinds.getNumPlatforms()))}
 
 
 def installed() -> str:
-    return f"OpenMM {library().__version__} with the platforms {', '.join(platforms())}"
-
-
-def platform_of(name: str) -> Any:
-    """A platform of OpenMM. Raises EngineError, which lists the available ones."""
-    if name not in (there := platforms()):
-        known = "" if name in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
-        cuda = "; pip install 'rigidmd[openmm-cuda]' installs it" if name == "CUDA" else ""
-        raise EngineError(f"OpenMM has no platform {name!r} here: there are {', '.join(there)}{known}{cuda}")
-    return library().Platform.getPlatformByName(name)
+    return f"OpenMM {library().__version__} with the platforms {', '.join(_platforms())}"
 
 
 def properties_of(platform: str, precision: str | None, threads: int | None) -> dict[str, str]:
@@ -69,8 +60,12 @@ class OpenmmEngine(ExternalEngine):
     def __init__(self, system: System, stage: int = 0, platform: str = "CPU", precision: str | None = None):
         mm = library()
         super().__init__(system, stage)
-        view = self._view
-        where, properties = platform_of(platform), properties_of(platform, precision, system.scene.threads)
+        view, there = self._view, _platforms()
+        if platform not in there:
+            known = "" if platform in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
+            cuda = "; pip install 'rigidmd[openmm-cuda]' installs it" if platform == "CUDA" else ""
+            raise EngineError(f"OpenMM has no platform {platform!r} here: there are {', '.join(there)}{known}{cuda}")
+        properties = properties_of(platform, precision, system.scene.threads)
         self.version = f"OpenMM {mm.__version__} on {platform}"
         self._particles = layout(view)
         self._precision = precision_of(platform, precision)
@@ -83,8 +78,8 @@ class OpenmmEngine(ExternalEngine):
             )
             for force in extra_forces(view, stage):
                 moved.addForce(force)
-            self._evaluating_context = mm.Context(evaluated, rest, where, properties)
-            self._moving_context = mm.Context(moved, self._integrator, where, properties)
+            self._evaluating_context = mm.Context(evaluated, rest, there[platform], properties)
+            self._moving_context = mm.Context(moved, self._integrator, there[platform], properties)
         except mm.OpenMMException as error:
             raise EngineError(f"OpenMM cannot hold this system on {platform}: {error}") from None
         self._groups = {force.getForceGroup() for force in evaluated.getForces()}
@@ -103,18 +98,21 @@ class OpenmmEngine(ExternalEngine):
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         if self._evaluated is None or not same_state(self._evaluated[0], state):
-            position, force = self._forces(state)
-            load = self._particles.bodies.load(state, position, force)
-            virial = self._virial(state, self._particles.bodies.intramolecular_virial(position, force))
-            self._evaluated = state.copy(), load, self._tallies(state, virial)
+            self._put(self._evaluating_context, state)
+            acting = self._groups - {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB}
+            on_all = self._evaluating_context.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
+            # the forces on mass points include those of virtual sites
+            bodies, force = self._particles.bodies, on_all[self._particles.point] * FORCE
+            position = bodies.points(state)[0]
+            virial = self._virial(state, bodies.intramolecular_virial(position, force))
+            self._evaluated = state.copy(), bodies.load(state, position, force), self._tallies(state, virial)
         _, load, tallies = self._evaluated
         return Load(load.force.copy(), load.torque_body.copy()), dict(tallies)
 
     def memory(self) -> dict[str, np.ndarray]:
         """OpenMM's checkpoint of the context: particles, random numbers, thermostat."""
         content = self._moving_context.createCheckpoint() if self._known_state is not None else b""
-        kept = np.frombuffer(content, np.uint8).copy()
-        return {"context": kept, "heat": np.array([self._heat_offset])}
+        return {"context": np.frombuffer(content, np.uint8).copy(), "heat": np.array([self._heat_offset])}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         kept = memory["context"]
@@ -136,8 +134,7 @@ class OpenmmEngine(ExternalEngine):
         if same_state(self._known_state, state):
             return
         self._put(self._moving_context, state)
-        velocity = self._particles.positions(state)[1]
-        self._moving_context.setVelocities(velocity * NM)
+        self._moving_context.setVelocities(self._particles.positions(state)[1] * NM)
         self._heat_offset = float(state.energy_ledger[HEAT]) - self._heat(state)
         self._known_state = state.copy()
 
@@ -145,7 +142,7 @@ class OpenmmEngine(ExternalEngine):
         """Set the positions and the cell of a context."""
         if not state.is_finite:
             raise NotFiniteError(state)
-        if self._particles.view.is_periodic:
+        if self._view.is_periodic:
             context.setPeriodicBoxVectors(*(state.cell * NM))
         context.setPositions(self._particles.positions(state)[0] * NM)
 
@@ -171,46 +168,35 @@ class OpenmmEngine(ExternalEngine):
         time."""
         if self.conserves_energy:
             return 0.0
-        groups = integration_groups(self._stage)
-        energy = self._moving_context.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
-        return KJ_PER_MOL * energy + sum(kinetic_energies(self._system, state))
-
-    def _energy(self, group: int | set[int]) -> float:
-        """Energy of some force groups in the evaluating context, u Å²/ps²."""
-        groups = group if isinstance(group, set) else {group}
-        return KJ_PER_MOL * self._evaluating_context.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
-
-    def _forces(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (p, 3) of mass points and the forces on them, including those of virtual sites."""
-        self._put(self._evaluating_context, state)
-        acting = self._groups - {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB}
-        force = self._evaluating_context.getState(getForces=True, groups=acting).getForces(asNumpy=True)._value
-        return self._particles.bodies.points(state)[0], force[self._particles.point] * FORCE
+        energy = _energy_of(self._moving_context, integration_groups(self._stage))
+        return energy + sum(kinetic_energies(self._system, state))
 
     def _tallies(self, state: State, virial: np.ndarray) -> dict[str, Tally]:
         """Energies by the names of rigidmd's terms, without the constants of single charges."""
-        view = self._particles.view
         self._put(self._evaluating_context, state)
-        found = {"lennard_jones": self._energy(Group.LENNARD_JONES)} if Group.LENNARD_JONES in self._groups else {}
-        law = view.coulomb
+
+        def energy(group: int) -> float:
+            return _energy_of(self._evaluating_context, {group})
+
+        found = {"lennard_jones": energy(Group.LENNARD_JONES)} if Group.LENNARD_JONES in self._groups else {}
+        view, law = self._view, self._view.coulomb
         if isinstance(law, ScreenedCoulomb):
-            alpha = law.alpha
-            charge = view.charge * COULOMB_CHARGE
+            alpha, charge = law.alpha, view.charge * COULOMB_CHARGE
             even = background(float(charge.sum()) ** 2, alpha).strength / state.volume
-            found["coulomb_real"] = self._energy(Group.COULOMB_PAIRS) - self._excluded_energy(state, alpha)
+            found["coulomb_real"] = energy(Group.COULOMB_PAIRS) - self._excluded_energy(state, alpha)
             if law.shift:
-                found["coulomb_real"] += self._energy(Group.STEP_COULOMB)
-            found["coulomb_reciprocal"] = self._energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
+                found["coulomb_real"] += energy(Group.STEP_COULOMB)
+            found["coulomb_reciprocal"] = energy(Group.RECIPROCAL) - self_energy(charge, alpha) - even
             if "coulomb_background" in view.system.terms:
                 found["coulomb_background"] = even
         elif law is not None:
-            found["coulomb"] = self._energy(Group.COULOMB_PAIRS)
+            found["coulomb"] = energy(Group.COULOMB_PAIRS)
         zero = np.zeros((3, 3))
         return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""
-        view, total = self._particles.view, 0.0
+        view, total = self._view, 0.0
         species = view.system.model.species
         for k, m in enumerate(view.system.species):
             count = int(((species == k) & ~view.frozen).sum())
@@ -232,7 +218,7 @@ class OpenmmEngine(ExternalEngine):
         takes two energies instead of twelve at each observation.
         """
         virial, strain = np.zeros((3, 3)), STRAIN[self._precision == "double"]
-        if not self._particles.view.is_periodic:
+        if not self._view.is_periodic:
             return virial
         groups = self._groups - {Group.TAIL}
 
@@ -242,7 +228,7 @@ class OpenmmEngine(ExternalEngine):
             for sign in (-1, 1):
                 by = np.eye(3) + sign * strain * along
                 self._put(self._evaluating_context, state._replace(position=state.position @ by, cell=state.cell @ by))
-                energy.append(self._energy(groups))
+                energy.append(_energy_of(self._evaluating_context, groups))
             return (energy[1] - energy[0]) / (2 * strain)
 
         output = self._system.scene.output
@@ -254,3 +240,8 @@ class OpenmmEngine(ExternalEngine):
             element = -slope(along) + (intramolecular[column, row] - intramolecular[row, column]) / 2
             virial[row, column] = virial[column, row] = element
         return virial
+
+
+def _energy_of(context, groups: set[int]) -> float:
+    """Energy of some force groups in a context, u Å²/ps²."""
+    return KJ_PER_MOL * context.getState(getEnergy=True, groups=groups).getPotentialEnergy()._value
