@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.defaults import electrostatics_module, with_defaults, with_engine_defaults, with_momentum_removal
+from rigidmd.assemble.defaults import with_defaults, with_engine_defaults, with_momentum_removal
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
@@ -23,8 +23,7 @@ from rigidmd.io.formats.cells import describe_basis, describe_cell
 from rigidmd.mechanics.free_rotor import NoRotor, split_rotor
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.fields import FIELDS, field_notes
-from rigidmd.scene.forces import POTENTIALS
-from rigidmd.scene.models import Molecule
+from rigidmd.scene.forces import ELECTROSTATICS, POTENTIALS
 from rigidmd.scene.molecules import missing_user_code
 
 
@@ -44,7 +43,12 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
-    model = _model(species, index, frozen)
+    mass, inertia = np.array([m.mass for m in species]), np.where(frozen[:, None], 0.0, [m.inertia for m in species])
+    rotor = split_rotor(inertia)
+    model = Model(
+        index.astype(np.int32), mass, np.where(frozen, 0.0, 1 / mass), inertia, rotor.inverse_inertia,
+        rotor if inertia.any() else NoRotor(),
+    )  # fmt: skip
     state = state_of(
         position=wrapped_between_walls(scene, space, start.position),
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
@@ -119,25 +123,13 @@ def with_user_code(system: System) -> System:
     )  # fmt: skip
 
 
-def _model(species: list[Molecule], index: np.ndarray, frozen: np.ndarray) -> Model:
-    inertia = np.where(frozen[:, None], 0.0, [m.inertia for m in species])
-    rotor = split_rotor(inertia)
-    mass = np.array([m.mass for m in species])
-    return Model(
-        index.astype(np.int32), mass, np.where(frozen, 0.0, 1 / mass), inertia, rotor.inverse_inertia,
-        rotor if inertia.any() else NoRotor(),
-    )  # fmt: skip
-
-
 def interactions(parts: SystemParts) -> Interactions:
     """The interactions of a resolved scene. Raises SceneError."""
     forces = parts.scene.forces
-    modules = [
-        import_module(f"rigidmd.forces.potentials.{key}") for key in POTENTIALS if getattr(forces, key) is not None
-    ]
+    names = [f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None]
     if any(m.charges.any() for m in parts.species):
-        modules += [module for module in [electrostatics_module(forces)] if module is not None]
-    found = [module.interactions(parts) for module in modules]
+        names.append(ELECTROSTATICS[forces.electrostatics].module)
+    found = [import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name]
     return Interactions(
         {name: term for part in found for name, term in part.terms.items()},
         {name: value for part in found for name, value in part.constants.items()},

@@ -21,7 +21,6 @@ from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.forces import ELECTROSTATICS, Forces
-from rigidmd.scene.stage import Stage
 
 CUTOFF = 9.0  # Å, in a periodic box
 #: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy of 1e-4 gained a
@@ -39,17 +38,16 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     """A scene with those defaults that depend on an external engine, and notes on them."""
     if (program := scene.engine.program) is None:
         return scene, []
-    notes = [f"computed by {scene.engine.title}"]
-    stages = []
+    notes, stages = [f"computed by {scene.engine.title}"], []
     for k, stage in enumerate(scene.stages):
+        found = {}
         if program.thermostat and stage.has_thermostat and stage.thermostat is None and not stage.thermostat_is_open:
-            notes.append(
-                f"stages.{k}: thermostat {program.thermostat}, because {program.name} has no velocity_rescaling"
-            )
-            stage = stage.model_copy(update={"thermostat": program.thermostat})
+            why = f"because {program.name} has no velocity_rescaling"
+            notes.append(f"stages.{k}: thermostat {program.thermostat}, {why}")
+            found["thermostat"] = program.thermostat
         if stage.ensemble == "npt" and stage.barostat is None:
-            stage = stage.model_copy(update={"barostat": program.barostat})
-        stages.append(stage)
+            found["barostat"] = program.barostat
+        stages.append(stage.model_copy(update=found))
     changed: dict[str, Any] = {"stages": tuple(stages)}
     forces = scene.forces
     if "ewald_truncation" in ELECTROSTATICS[forces.electrostatics].keys and forces.ewald_truncation is None:
@@ -57,14 +55,6 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
     if scene.run.remove_momentum_interval_ps is None:
         changed["run"] = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
     return scene.model_copy(update=changed), notes
-
-
-def stage_with_defaults(scene: MolecularScene, stage: Stage) -> Stage:
-    """A stage with all defaults. A barostat of an external engine without a name has only a time constant."""
-    found = stage.with_defaults
-    if scene.engine.is_external and stage.ensemble == "npt" and stage.barostat is None:
-        found = found.model_copy(update={"barostat": None, "barostat_interval_ps": None})
-    return found
 
 
 class SceneWithDefaults(NamedTuple):
@@ -90,22 +80,24 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     output = scene.output
     if output.velocities is None:
         output = output.model_copy(update={"velocities": output.can_store_velocities})
+    stages = [stage.with_defaults for stage in scene.stages]
+    for k, stage in enumerate(scene.stages):
+        if scene.engine.is_external and stage.ensemble == "npt" and stage.barostat is None:
+            # the barostat of an external engine without a name has only a time constant
+            stages[k] = stages[k].model_copy(update={"barostat": None, "barostat_interval_ps": None})
     tables = {
-        "forces": scene.forces.model_copy(update=numbers | found.numbers),
-        "output": output,
-        "stages": tuple(stage_with_defaults(scene, stage) for stage in scene.stages),
-    }
-    # The folder of a run has a copy of the file under another name, which must not rename the species.
-    tables["molecules"] = tuple(
-        entry if entry.file is None else entry.model_copy(update={"name": composition.species[k].name})
-        for k, entry in enumerate(scene.molecules)
-    )
+        "forces": scene.forces.model_copy(update=numbers | found.numbers), "output": output, "stages": tuple(stages),
+        # the folder of a run has a copy of the file under another name, which must not rename the species
+        "molecules": tuple(
+            entry if entry.file is None else entry.model_copy(update={"name": composition.species[k].name})
+            for k, entry in enumerate(scene.molecules)
+        ),
+    }  # fmt: skip
     if scene.structure is not None:
         tables["structure"] = scene.structure.model_copy(update={"topology": scene.topology})
     reads_velocities = scene.structure is not None and scene.structure.velocities
     if scene.start.temperature_K is None and not reads_velocities:
-        first = scene.first_moving
-        temperature = first.temperatures[0] if first else 0.0
+        temperature = scene.first_moving.temperatures[0] if scene.first_moving else 0.0
         tables["start"] = scene.start.model_copy(update={"temperature_K": temperature})
     return SceneWithDefaults(scene.model_copy(update=tables), faults, found.grid)
 
@@ -140,8 +132,7 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
             "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
         )
     for m in composition.species:
-        extent = pdist(m.positions_body).max(initial=0.0)
-        if extent > half:
+        if (extent := pdist(m.positions_body).max(initial=0.0)) > half:
             longer = f"more than half {least} of the box, {half:.3f} Å"
             faults.append(f"a molecule of {m.name} is {extent:.2f} Å long, {longer}")
     if start is not None and start >= cutoff:

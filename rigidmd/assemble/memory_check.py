@@ -3,7 +3,6 @@
 NumPy's arrays of zeros take no memory before they are written, so the arrays of an engine can be made and added up.
 """
 
-from collections.abc import Iterator
 from math import prod
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import numpy as np
 from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
 from rigidmd.errors import SceneError
-from rigidmd.scene import BodyScene
+from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import not_none
 from rigidmd.units import FEMTOSECOND
 
@@ -55,7 +54,7 @@ def check_memory_of_samples(scene: BodyScene) -> None:
 
 def check_memory(system: "System") -> None:
     """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids, samples."""
-    source, output = system.scene.source, system.scene.output
+    source = system.scene.source
     try:
         needed = bytes_of(system)
     except MemoryError as error:  # of NumPy, with the shape of the array
@@ -64,25 +63,20 @@ def check_memory(system: "System") -> None:
         free = format_gigabytes(free_memory())
         fault = f"a single array of it needs {format_gigabytes(needed)}, and this machine has {free} free"
         raise SceneError(source, [f"not enough memory: {fault}: {ADVICE}"]) from None
-    lines = f"a run with {observation_count(system, output.log_interval_ps):.3g} lines in its log"
+    lines, samples = _samples(system.scene)
     longer = "lengthen output.log_interval_ps and output.trajectory_interval_ps"
-    _require(source, bytes_of_samples(system), lines, longer)
+    _require(source, samples, f"a run with {lines:.3g} lines in its log", longer)
     _require(source, needed, "the run", ADVICE)
 
 
-def observation_count(system: "System", interval: float) -> float:
-    """Number of observations of a run at an interval (ps) and at the ends of its stages."""
-    return sum(
-        2 + stage.duration / (interval if stage.is_auto else max(interval, stage.timestep_fs * FEMTOSECOND))
-        for stage in system.scene.stages
+def _samples(scene: MolecularScene) -> tuple[float, float]:
+    """Number of lines of the log of a run, and the bytes of these lines and of the times of frames at its end."""
+    output = scene.output
+    lines, frames = (  # at the interval and at the ends of stages
+        sum(2 + s.duration / (every if s.is_auto else max(every, s.timestep_fs * FEMTOSECOND)) for s in scene.stages)
+        for every in (output.log_interval_ps, output.trajectory_interval_ps)
     )
-
-
-def bytes_of_samples(system: "System") -> float:
-    """Bytes of the lines of the log and the times of frames at the end of a run."""
-    output = system.scene.output
-    frames = observation_count(system, output.trajectory_interval_ps) if output.trajectory else 0
-    return BYTES_PER_LOG_LINE * observation_count(system, output.log_interval_ps) + BYTES_PER_FRAME * frames
+    return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (frames if output.trajectory else 0)
 
 
 def bytes_of(system: "System") -> int:
@@ -91,24 +85,18 @@ def bytes_of(system: "System") -> int:
     trajectory = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0
     arrays = 3 * array_bytes(state) + 2 * array_bytes(no_load(state))
     arrays += array_bytes((system.engine().new_workspaces(state), system.model))
-    return arrays + trajectory + round(bytes_of_samples(system))
+    return arrays + trajectory + round(_samples(system.scene)[1])
 
 
 def array_bytes(value: tuple) -> int:
     """Bytes of all arrays in nested tuples. Memory that several arrays use counts once."""
-    return sum({id(owner): owner.nbytes for owner in map(_owner, _arrays(value))}.values())
-
-
-def _owner(array: np.ndarray) -> np.ndarray:
-    """The array whose memory an array uses."""
-    while isinstance(array.base, np.ndarray):
-        array = array.base
-    return array
-
-
-def _arrays(value) -> Iterator[np.ndarray]:
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, tuple):
-        for part in value:
-            yield from _arrays(part)
+    found, rest = {}, [value]
+    while rest:
+        part = rest.pop()
+        if isinstance(part, tuple):
+            rest += part
+        elif isinstance(part, np.ndarray):
+            while isinstance(part.base, np.ndarray):  # the array whose memory it uses
+                part = part.base
+            found[id(part)] = part.nbytes
+    return sum(found.values())

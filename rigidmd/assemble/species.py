@@ -1,10 +1,10 @@
-"""The species of a scene: their rigid molecules, and which molecules are frozen."""
+"""The species of a scene: their rigid molecules, and which molecules are frozen. Models from the geometry of a molecule
+and a table of parameters."""
 
 # isort: skip_file
 from collections import Counter
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -107,33 +107,25 @@ SLACK = 1.25
 NEARLY, EXACTLY = 0.05, 1e-9
 
 
-class GeometryModel(NamedTuple):
-    """The file of a model, its molecule, and notes."""
-
-    file: MoleculeFile
-    molecule: Molecule
-    notes: list[str]
-
-
-def model_from_geometry(geometry: Path, parameters: Path | None, name: str | None) -> GeometryModel:
-    """The model of a structure file with one molecule, with the positions in the file.
+def model_from_geometry(
+    geometry: Path, parameters: Path | None, name: str | None
+) -> tuple[MoleculeFile, Molecule, list[str]]:
+    """The model of a structure file with one molecule, with the positions in the file: its file, molecule, notes.
 
     parameters : a table of parameters by atom name or element; without one the model has masses and no interactions
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """
-    name = geometry.stem if name is None else name
     notes, source = [], [f"geometry of {geometry.name}"]
     if fault := unreadable_reason(geometry):
         raise StructureError(str(geometry), [fault])
+    names, elements, *_ = read_geometry(geometry)
     if parameters is None:
-        names, elements, *_ = read_geometry(geometry)
         sites = sites_of_geometry(geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), "")
         notes.append("it has no interactions: give its sites charge_e, sigma_A and epsilon_kJ_mol, or use --parameters")
     else:
         table = read_parameters(parameters)
         sites = sites_of_geometry(geometry, (), table.sites, "the table")
         source.append(f"parameters of {parameters.name}" + (f": {table.source}" if table.source else ""))
-        names, elements, *_ = read_geometry(geometry)
         used = [find_site(table.sites, *atom) for atom in dict.fromkeys(zip(names, elements, strict=True))]
         if idle := [entry.name for entry in table.sites if entry not in used]:
             notes.append(f"{parameters}: no atom uses {', '.join(idle)}")
@@ -141,9 +133,11 @@ def model_from_geometry(geometry: Path, parameters: Path | None, name: str | Non
     if long := sorted({atom for atom in names if len(atom) > 5}):
         notes.append(f"names of atoms have five characters at most: {', '.join(long)} are cut")
     atoms = read_atoms(geometry)
-    data = {"name": name, "source": "; ".join(source), "residue_names": _residue(atoms), "sites": sites}
+    residues = {residue[1] for residue in atoms.residue if len(residue) > 1}
+    residues = [x for x in residues if len(residues) == 1 and x.isascii() and x.isprintable() and " " not in x]
+    data = {"name": geometry.stem if name is None else name, "source": "; ".join(source)}
     try:
-        file = MoleculeFile.model_validate(data)
+        file = MoleculeFile.model_validate(data | {"residue_names": tuple(residues), "sites": sites})
     except ValidationError as error:
         raise MoleculeError(str(geometry), validation_messages(error, MoleculeFile)) from None
     found = molecule(file.name, file.sites, file.title, file.source, file.residue_names)
@@ -153,7 +147,7 @@ def model_from_geometry(geometry: Path, parameters: Path | None, name: str | Non
     if off > EXACTLY:
         nearly = f"nearly but not exactly {f'{whole:+d}' if whole else 0}" if off < NEARLY else "not a whole number"
         notes.append(f"the charges sum to {found.charge:+.6g} e, {nearly}")
-    return GeometryModel(file, found, notes)
+    return file, found, notes
 
 
 def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -170,12 +164,6 @@ def _numbered(sites: tuple[Site, ...]) -> tuple[Site, ...]:
         taken.add(name)
         named.append(site.model_copy(update={"name": name}))
     return tuple(named)
-
-
-def _residue(atoms: Atoms) -> tuple[str, ...]:
-    """The name of the only residue, if structure files can store it."""
-    names = {residue[1] for residue in atoms.residue if len(residue) > 1}
-    return tuple(x for x in names if len(names) == 1 and x.isascii() and x.isprintable() and " " not in x)
 
 
 def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:

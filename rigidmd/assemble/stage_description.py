@@ -19,7 +19,15 @@ def describe_stage(stage: Stage) -> list[str]:
     """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. Of a minimisation: the
     minimised quantity; the limits of convergence."""
     if stage.is_minimisation:
-        return _minimisation(stage)
+        what, limits = "the potential energy", [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
+        limits.append(f"torques of {stage.torque_limit_kJ_mol:g} kJ/mol")
+        if stage.changes_box:
+            what = f"the enthalpy at {_pressure(stage)} bar, the cell {stage.pressure_coupling.replace('_', '-')}"
+            limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
+        return [
+            f"{stage.label}: to a minimum of {what}; no time passes and momenta do not change",
+            f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most {stage.most_iterations} iterations",
+        ]
     rounded = stage.steps * stage.timestep_fs * FEMTOSECOND
     text = f"{stage.label}: {stage.steps} steps of {stage.timestep_fs:g} fs = {rounded:g} ps, {stage.integrator}"
     if stage.is_auto:
@@ -28,26 +36,21 @@ def describe_stage(stage: Stage) -> list[str]:
             error = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
         elif stage.bias_kT:
             error = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
-        choice = f"integrator and step chosen at its start for an error of {error}"
-        text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
+        text = (
+            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {error}"
+        )
     if stage.has_thermostat:
         kind, described = stage.thermostat_kind, THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
         text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
-    return [text, f"samples {_sampled(stage)}; conserves {_conserved(stage)}"]
-
-
-def _minimisation(stage: Stage) -> list[str]:
-    what, limits = "the potential energy", [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]
-    limits.append(f"torques of {stage.torque_limit_kJ_mol:g} kJ/mol")
-    if stage.changes_box:
-        what = f"the enthalpy at {_pressure(stage)} bar, the cell {stage.pressure_coupling.replace('_', '-')}"
-        limits.append(f"a pressure within {stage.pressure_limit_bar:g} bar")
-    return [
-        f"{stage.label}: to a minimum of {what}; no time passes and momenta do not change",
-        f"limits: {', '.join(limits[:-1])} and {limits[-1]}; at most {stage.most_iterations} iterations",
-    ]
+    sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the error of the step
+    if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
+        sampled += ", with the invariant measure of the shape"
+    if stage.ramps:
+        sampled += ", at the temperature and pressure of each moment"
+    momentum = "total momentum" if stage.keeps_momentum else "not the total momentum"
+    return [text, f"samples {sampled}; conserves {conserved}, {momentum}"]
 
 
 def _barostat(stage: Stage) -> str:
@@ -71,23 +74,6 @@ def _pressure(stage: Stage) -> str:
 
 def _ramp(ends: tuple[float, float]) -> str:
     return f"{ends[0]:g}" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g}"
-
-
-def _sampled(stage: Stage) -> str:
-    """The sampled distribution, up to the error of the step."""
-    found = DISTRIBUTIONS[stage.ensemble][0]
-    if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
-        found += ", with the invariant measure of the shape"
-    first, last = stage.pressures if stage.has_barostat else (0, 0)
-    if (stage.has_thermostat and len(set(stage.temperatures)) > 1) or first != last:
-        found += ", at the temperature and pressure of each moment"
-    return found
-
-
-def _conserved(stage: Stage) -> str:
-    """The conserved quantities, up to the error of the step."""
-    energy = DISTRIBUTIONS[stage.ensemble][1]
-    return f"{energy}, total momentum" if stage.keeps_momentum else f"{energy}, not the total momentum"
 
 
 def stage_notes(stages: tuple[Stage, ...]) -> list[str]:

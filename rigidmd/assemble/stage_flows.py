@@ -10,7 +10,6 @@ from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp, VelocityRescaling, constant_ramp
 from rigidmd.engines.system import System
 from rigidmd.scene import couplings
-from rigidmd.scene.couplings import Six
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND
 
@@ -50,8 +49,7 @@ def thermostat_of(system: System, k: int) -> NamedTuple:
 def barostat_of(system: System, k: int) -> NamedTuple:
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
-    first, last = stage.pressures
-    pressure = Pressure(_scaled(first, BAR), _scaled(last, BAR), float(stage.steps))
+    pressure = Pressure(*(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps))
     tail = system.tail
     tail_terms = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
@@ -60,11 +58,6 @@ def barostat_of(system: System, k: int) -> NamedTuple:
         (x, y, z), tail_terms, key,
     )  # fmt: skip
     return BAROSTATS[stage.barostat_kind](stage, given)
-
-
-def _scaled(tensor: Six, factor: float) -> Six:
-    xx, yy, zz, xy, xz, yz = tensor
-    return xx * factor, yy * factor, zz * factor, xy * factor, xz * factor, yz * factor
 
 
 def _thermal(stage: Stage) -> Ramp:

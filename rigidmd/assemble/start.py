@@ -1,6 +1,6 @@
-"""The start of a scene of molecules: positions, orientations and momenta."""
+"""The start of a scene of molecules: positions, orientations and momenta; overlaps of molecules."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,19 +54,17 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
             raise StructureError(scene.structure_source, faults)
         return found
     counts = [not_none(entry.count) for entry in scene.molecules]
-    sites = sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
-    check_memory_of_molecules(scene.source, sum(counts), sites)
-    mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
-    cell = scene.box.cell
-    if cell is None:
+    n, sites = sum(counts), sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
+    check_memory_of_molecules(scene.source, n, sites)
+    if (cell := scene.box.cell) is None:
+        mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
         cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
     if fault := cell_error(cell):
         raise SceneError(scene.source, [f"box: {fault}"])
     rng = np.random.default_rng([scene.seed, LATTICE])
-    n = sum(counts)
     found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
-        position=start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),
+        position=_start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),
         velocity=None, angular_momentum_body=None, cell=cell if scene.box.periodic else None,
     )  # fmt: skip
     return with_reduced_cell(found, "its", may_rotate=False)
@@ -98,10 +96,11 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, start: Config
     return []
 
 
-def start_lattice(
+def _start_lattice(
     scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """n points (n, 3) on a lattice in a box with edges (3,), at a distance from the walls. Raises SceneError."""
+    """n points (n, 3), drawn at random from a nearly cubic lattice in a rectangular box with edges (3,), at a distance
+    from the walls. Raises SceneError."""
     low, high, faults = np.zeros(3), edges.copy(), []
     for axis, name in enumerate(AXES):
         across = [walls for walls in scene.fields.walls if walls.direction == axis]
@@ -117,16 +116,12 @@ def start_lattice(
             faults.append(f"fields.walls: the walls across {name} leave no space for molecules between them")
     if faults:
         raise SceneError(scene.source, faults)
-    return low + lattice(n, high - low, rng)
-
-
-def lattice(n: int, edges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """n points (n, 3) on a nearly cubic lattice in a rectangular box with edges (3,), drawn at random."""
+    edges = high - low
     shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
     while shape.prod() < n:
         shape[np.argmax(edges / shape)] += 1
     points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    return (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
+    return low + (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
 
 
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there
@@ -141,10 +136,10 @@ def overlaps(system: "System") -> list[str]:
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
-    wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
-    near = close_pairs(system, system.state, *wanted)
-    sigma = gather_per_molecule(cores, system.model.species) if near else np.zeros(0)
-    faults = []
+    near = close_pairs(
+        system, system.state, (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
+    )
+    sigma, faults = gather_per_molecule(cores, system.model.species), []
     for i, j, distance in near:
         both = sigma[i] > 0 and sigma[j] > 0
         if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
@@ -168,32 +163,19 @@ def close_pairs(
     for radius, sites_of in wanted:
         arm = max(np.linalg.norm(m.positions_body[sites_of(m)], axis=1).max(initial=0.0) for m in species)
         reach = max(reach, radius + 2 * arm if arm <= system.smallest_diameter else inf)
-    crowded = np.arange(len(state.position))
+    crowded, cell = np.arange(len(state.position)), state.cell if state.volume < inf else None
     if reach < inf:  # few centres are so close; a search among all sites would take five times as long
-        crowded = np.unique(np.concatenate(pairs_within(state.position, _cell(state), reach)[:2]))
+        crowded = np.unique(np.concatenate(pairs_within(state.position, cell, reach)[:2]))
+    kinds, counts, free = system.model.species[crowded], system.sites_per_molecule, mobile(system.model)
     near: dict[tuple[int, int], float] = {}
     for radius, sites_of in wanted if len(crowded) else ():
-        for i, j, distance in _close_among(system, state, crowded, radius, [sites_of(m) for m in species]):
-            pair = min(i, j), max(i, j)
-            near[pair] = min(distance, near.get(pair, inf))
+        indices = [sites_of(m) for m in species]
+        owner = np.repeat(crowded, np.array([len(sites) for sites in indices])[kinds])
+        site = (np.cumsum(counts) - counts)[owner] + gather_per_molecule(indices, kinds)
+        offsets = [m.positions_body[sites] for m, sites in zip(species, indices, strict=True)]
+        position = system.positions_of(state, owner, gather_per_molecule(offsets, kinds))
+        i, j, distance = pairs_within(position, cell, radius)
+        kept = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
+        for *pair, length in zip(site[i[kept]].tolist(), site[j[kept]].tolist(), distance[kept].tolist(), strict=True):
+            near[min(pair), max(pair)] = min(length, near.get((min(pair), max(pair)), inf))
     return [(*pair, near[pair]) for pair in sorted(near)]
-
-
-def _close_among(
-    system: "System", state: State, molecules: np.ndarray, radius: float, indices: list[np.ndarray]
-) -> Iterator[tuple[int, int, float]]:
-    """The pairs of `close_pairs` among some molecules and the sites indices[k] of species k."""
-    kinds, counts = system.model.species[molecules], system.sites_per_molecule
-    owner = np.repeat(molecules, np.array([len(sites) for sites in indices])[kinds])
-    site = (np.cumsum(counts) - counts)[owner] + gather_per_molecule(indices, kinds)
-    offset = gather_per_molecule(
-        [m.positions_body[sites] for m, sites in zip(system.species, indices, strict=True)], kinds
-    )
-    i, j, distance = pairs_within(system.positions_of(state, owner, offset), _cell(state), radius)
-    a, b, free = owner[i], owner[j], mobile(system.model)
-    kept = (a != b) & (free[a] | free[b])
-    return zip(site[i[kept]].tolist(), site[j[kept]].tolist(), distance[kept].tolist(), strict=True)
-
-
-def _cell(state: State) -> np.ndarray | None:
-    return state.cell if state.volume < inf else None

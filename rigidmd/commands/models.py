@@ -71,11 +71,11 @@ def _write_model(options: argparse.Namespace) -> int:
     path = Path(options.output or f"{geometry.stem}.toml")
     if options.draw:
         raise MoleculeError("models", [f"--from writes a model; draw it afterwards: rigidmd models {path} --draw"])
-    made = model_from_geometry(geometry, parameters, options.custom_name)
+    file, found, notes = model_from_geometry(geometry, parameters, options.custom_name)
     check_target(path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])])
-    write_model(path, made.file)
-    print(f"{path}: {made.molecule.name}, {made.molecule.description}; {made.file.source}")
-    for note in made.notes:
+    write_model(path, file)
+    print(f"{path}: {found.name}, {found.description}; {file.source}")
+    for note in notes:
         warn(note)
     print("next:")
     print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")

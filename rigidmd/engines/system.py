@@ -164,12 +164,12 @@ class System:
 
     def site_positions(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å. Molecules are whole; wrapped: centres of mass inside the box."""
-        owner = self.sites.molecule
-        return _gather(self.centres(state, wrapped), owner) + _lab_offsets(state, owner, self.sites.offset_body)
+        whole = state._replace(position=self.centres(state, wrapped))
+        return self.positions_of(whole, self.sites.molecule, self.sites.offset_body)
 
     def positions_of(self, state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
         """Positions (k, 3) of points fixed in molecules (k,) at offsets (k, 3), lab frame, Å, not wrapped."""
-        return _gather(state.position, molecule) + _lab_offsets(state, molecule, offset_body)
+        return state.position.take(molecule, axis=0) + _lab_offsets(state, molecule, offset_body)
 
     def centres(self, state: State, wrapped: bool = False) -> np.ndarray:
         """Centres of mass (n, 3), lab frame, Å; wrapped: inside the box."""
@@ -178,21 +178,17 @@ class System:
     def site_velocities(self, state: State) -> np.ndarray:
         """Velocities (s, 3) of all sites, lab frame, Å/ps."""
         owner = self.sites.molecule
-        velocity = _gather(state.velocity, owner)
+        velocity = state.velocity.take(owner, axis=0)
         if len(state.rotation) == 0:
             return velocity
         omega = state.angular_momentum_body * self.model.inverse_inertia[self.model.species]
         lab = np.einsum("nij,nj->ni", state.rotation, omega)
-        return velocity + np.cross(_gather(lab, owner), _lab_offsets(state, owner, self.sites.offset_body))
+        return velocity + np.cross(lab.take(owner, axis=0), _lab_offsets(state, owner, self.sites.offset_body))
 
 
 def _lab_offsets(state: State, molecule: np.ndarray, offset_body: np.ndarray) -> np.ndarray:
     """Offsets (k, 3) of points from the centres of molecules (k,): from the body frame to the lab frame, Å."""
     if len(state.rotation) == 0:
         return np.zeros_like(offset_body)
-    return np.einsum("sij,sj->si", _gather(state.rotation, molecule), offset_body)
-
-
-def _gather(values: np.ndarray, molecule: np.ndarray) -> np.ndarray:
-    """`values` gathered per molecule. `take` is 4 times faster than indexing."""
-    return values.take(molecule, axis=0)
+    # `take` is 4 times faster than indexing
+    return np.einsum("sij,sj->si", state.rotation.take(molecule, axis=0), offset_body)
