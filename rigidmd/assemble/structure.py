@@ -66,18 +66,12 @@ def read_structure(
             _check_box(path, found.cell, [])
     else:
         found = _read_molecules(path, species, wanted, periodic, tolerance, frame, atom_types, topology, content)
-    notes = list(found.notes)
-    if not periodic:
-        cell = None
-    elif wanted is not None:
-        cell = wanted
-        if found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
-            notes.append("the box of the scene is used, not the box of the file")
-    else:
-        cell = found.cell
+    cell = None if not periodic else found.cell if wanted is None else wanted
+    if cell is not None and found.cell is not None and not same_lattice(found.cell, cell, SAME_BOX):
+        found = found._replace(notes=(*found.notes, "the box of the scene is used, not the box of the file"))
     if cell is not None and (fault := cell_error(cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
-    found = found._replace(cell=cell, notes=tuple(notes))
+    found = found._replace(cell=cell)
     if repeat != (1, 1, 1):
         count = prod(repeat) * np.bincount(found.species, minlength=len(species)).astype(object)
         sites = sum(n * len(m.masses) for n, m in zip(count, species, strict=True))
@@ -99,13 +93,13 @@ def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Con
         f"{whose} lattice is given by the cell with {describe_cell(cell)}, {describe_basis(basis)}, "
         f"in place of {describe_cell(found.cell)}"
     )
-    if np.array_equal(rotation, np.eye(3)):
-        return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
-    return found._replace(
-        cell=cell, position=found.position @ rotation.T, rotation=rotation @ found.rotation,
-        velocity=None if found.velocity is None else found.velocity @ rotation.T,
-        notes=(*found.notes, f"{note}; rotated, contents included"), basis=basis,
-    )  # fmt: skip
+    if not np.array_equal(rotation, np.eye(3)):
+        note += "; rotated, contents included"
+        found = found._replace(
+            position=found.position @ rotation.T, rotation=rotation @ found.rotation,
+            velocity=None if found.velocity is None else found.velocity @ rotation.T,
+        )  # fmt: skip
+    return found._replace(cell=cell, notes=(*found.notes, note), basis=basis)
 
 
 def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configuration:
@@ -128,7 +122,12 @@ def _repeated(found: Configuration, repeat: tuple[int, int, int]) -> Configurati
 def _read_molecules(
     path: Path, species: list[Molecule], wanted, periodic: bool, tolerance: float, frame, atom_types, topology, content
 ) -> Configuration:
-    _check_types(path, atom_types or {}, species)
+    known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
+    hint = f"is not a site or element of the scene's molecules; there are {', '.join(known)}"
+    unknown = [(number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")]
+    if unknown:
+        faults = [f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}" for k, name in unknown]
+        raise StructureError(str(path), faults)
     atoms = read_atoms(path, frame, atom_types, topology, content)
     notes = list(atoms.notes)
     if atoms.cell is not None:
@@ -170,16 +169,6 @@ def _read_molecules(
     )  # fmt: skip
 
 
-def _check_types(path: Path, atom_types: dict[str, str], species: list[Molecule]) -> None:
-    """Raise StructureError for atom types that are not sites or elements of the scene."""
-    known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
-    hint = f"is not a site or element of the scene's molecules; there are {', '.join(known)}"
-    unknown = [(number, name) for number, name in atom_types.items() if name not in (*known, "X")]
-    faults = [f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}" for k, name in unknown]
-    if faults:
-        raise StructureError(str(path), faults)
-
-
 def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     """Messages on atoms of the file whose mass no site of the scene has."""
     if atoms.masses is None:
@@ -190,12 +179,10 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
         for name, mass in sorted(set(zip(atoms.names, atoms.masses.tolist(), strict=True)))
         if mass >= NO_MASS and np.abs(masses - mass).min() > SAME_MASS * mass
     ]
-    if not unknown:
-        return []
-    return [
-        f"its atom types {', '.join(unknown)} have masses of no site of the scene's molecules "
-        f"({', '.join(f'{mass:g}' for mass in masses)} u): set structure.atom_types, or these masses by masses_u"
-    ]
+    there = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
+    advice = "set structure.atom_types, or these masses by masses_u"
+    fault = f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"
+    return [fault] if unknown else []
 
 
 def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
@@ -209,11 +196,10 @@ def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecul
             mass = float(molecule.masses[site])
             for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
                 different[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
-    if not different:
-        return []
-    return [
+    note = (
         f"the masses of the scene are used, not the masses in the file ({'; '.join(different)}): masses_u changes them"
-    ]
+    )
+    return [note] if different else []
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
@@ -227,15 +213,12 @@ def _massless(matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
     """Notes on massless sites, whose positions follow from the template and not from the file."""
     lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
     expected = int(np.array(lacking)[matched.species].sum())
-    there = sum(matched.massless.values())
+    there, what = sum(matched.massless.values()), "sites without mass"
     if there > expected:
-        return [f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no model: left out"]
-    if there < expected:
-        names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
-        return [
-            f"{expected - there} sites without mass are missing in the file ({names}): built from the rigid template"
-        ]
-    return []
+        return [f"{there - expected} {what} ({', '.join(matched.massless)}) are in no model: left out"]
+    names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
+    missing = f"{expected - there} {what} are missing in the file ({names}): built from the rigid template"
+    return [missing] if there < expected else []
 
 
 def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], notes: list[str]):
@@ -251,10 +234,8 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
         return None, None
     n = len(matched.species)
     velocity, angular = np.zeros((n, 3)), np.zeros((n, 3))
-    for k, molecule in enumerate(species):
-        members = np.flatnonzero(matched.species == k)
-        if len(members) == 0:
-            continue
+    for k in np.unique(matched.species):
+        members, molecule = np.flatnonzero(matched.species == k), species[k]
         sites = massive_sites(molecule)
         masses = molecule.masses[sites]
         v = atoms.velocity[np.array([matched.atoms[m] for m in members])]
@@ -275,12 +256,13 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
     if not bonds or len(atoms.position) < 2:
         return []
     nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
-    found = [
+    low, high = min(bonds) / CLOSE, max(bonds) * CLOSE
+    fitting = [unit for unit, size in ({"Å": 1.0} | OTHER_UNITS).items() if low <= nearest * size <= high]
+    return [
         f"the coordinates seem to be in {unit}, not in Å as in this format: the nearest distance is {nearest:.3g}"
-        for unit, angstrom in OTHER_UNITS.items()
-        if min(bonds) / CLOSE <= nearest * angstrom <= max(bonds) * CLOSE
+        for unit in fitting
+        if "Å" not in fitting
     ]
-    return [] if min(bonds) / CLOSE <= nearest <= max(bonds) * CLOSE else found
 
 
 def _other_model(molecule: Molecule, saved: np.ndarray) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
-from rigidmd.assemble.user_code.pair_potential import PairLaw, PairPotentialError, check_cutoff, pair_law
+from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.state import State
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
@@ -45,10 +45,9 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
     for k, entry in enumerate(scene.forces.custom):
         try:
             found.append(_custom(scene, entry, f"forces.custom.{k}"))
-        except (SceneError, PairPotentialError) as error:
-            faults += [(entry.module, f"forces.custom.{k}: {fault}") for fault in error.errors]
-        except ValueError as error:
-            faults.append((None, f"forces.custom.{k}: {error}"))
+        except (SceneError, ValueError) as error:
+            module = entry.module if isinstance(error, SceneError) else None
+            faults += [(module, f"forces.custom.{k}: {fault}") for fault in getattr(error, "errors", [error])]
     if faults:  # each file once
         messages = {module or fault: fault for module, fault in reversed(faults)}
         raise SceneError(scene.source, list(messages.values())[::-1])
@@ -121,13 +120,9 @@ def user_terms(system: "System") -> UserTerms:
             term = _term(made, name, system, found)
             if not isinstance(term, PairForces):
                 found.changes_momentum[:] |= changes_momentum(term)
-        except (PairPotentialError, SceneError) as error:
-            faults += [f"{name}: {fault}" for fault in error.errors]
-            continue
-        except (ValueError, UserForceError) as error:
-            faults.append(f"{name}: {error}")
-            continue
-        found.terms[name] = term
+            found.terms[name] = term
+        except (SceneError, UserForceError, ValueError) as error:
+            faults += [f"{name}: {fault}" for fault in getattr(error, "errors", [error])]
     thermostat = found.thermostat
     if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
         need = "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method for_stage(system, k)"
@@ -142,16 +137,15 @@ def user_terms(system: "System") -> UserTerms:
 def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTuple:
     """The term of one object. Raises PairPotentialError, ValueError, UserForceError."""
     if isinstance(made, PairLaw):
-        potential = made.bind(system)
-        if error := potential.formula.error:
-            found.notes.append(f"{name}: the error of its spline is {error:.1e} of its deepest energy")
-        found.notes.extend(f"{name}: {note}" for note in potential.notes)
-        if potential.tail is not None:
-            found.tails.append(potential.tail)
+        term, formula, tail, notes = made.bind(system)
+        if formula.error:
+            found.notes.append(f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy")
+        found.notes.extend(f"{name}: {note}" for note in notes)
+        found.tails.extend([] if tail is None else [tail])
         cutoff, truncation = made.cutoff_A or system.cutoff, made.truncation or system.scene.forces.truncation
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
-        found.descriptions[name] = f"{potential.formula.text}, {len(potential.term.group)} sites, {reach}"
-        return potential.term
+        found.descriptions[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
+        return term
     if isinstance(made, Force):
         bound = BoundForce(made, name, system)
         found.python_forces[name] = bound

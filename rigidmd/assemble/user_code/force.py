@@ -89,34 +89,26 @@ class BoundForce:
         """Fill a workspace with the forces at a state. Raises UserForceError."""
         state = State(*(_read_only(array) for array in state))
         if self._by_site:
-            position = _read_only(self.system.site_positions(state))
-            energy, force, torque, virial = self._of_sites(position, state)
+            energy, force, torque, virial = self._of_sites(_read_only(self.system.site_positions(state)), state)
         else:
             energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, state), 4)
         self._fill(workspace.force, force, "forces")
         self._fill(workspace.torque_body, torque, "torques")
         if not np.isfinite(energy):
             raise self._error(f"the energy {energy}")
+        numbers = np.zeros((3, 3)) if virial is None else _numbers(virial)
+        if numbers is None or numbers.shape != (3, 3) or not np.isfinite(numbers).all():
+            raise self._error(f"{virial!r:.60} as its virial, not (3, 3) finite numbers")
         workspace.tally[0] = energy * KJ_PER_MOL
-        workspace.tally[1:] = self._virial(virial)
+        workspace.tally[1:] = KJ_PER_MOL * numbers.ravel()
         workspace.fresh[0] = 1
 
-    def _virial(self, given: Any) -> np.ndarray:
-        """A virial (9,), u Å²/ps²; None is 0."""
-        virial = np.zeros((3, 3)) if given is None else _numbers(given)
-        if virial is None or virial.shape != (3, 3) or not np.isfinite(virial).all():
-            raise self._error(f"{given!r:.60} as its virial, not (3, 3) finite numbers")
-        return KJ_PER_MOL * virial.ravel()
-
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
-        system = self.system
         energy, force, virial, _ = self._parts(self._called("on_sites", self.force.on_sites, position, state), 3)
-        on_sites = np.zeros(position.shape)
-        molecule = system.sites.molecule
+        on_sites, molecule = np.zeros(position.shape), self.system.sites.molecule
         self._fill(on_sites, force, "forces", molecule, 1.0)
-        total = np.zeros((len(state.velocity), 3))
+        total, torque = np.zeros((len(state.velocity), 3)), None
         np.add.at(total, molecule, on_sites)
-        torque = None
         if len(state.rotation):
             lab = np.zeros_like(total)
             np.add.at(lab, molecule, np.cross(position - state.position[molecule], on_sites))

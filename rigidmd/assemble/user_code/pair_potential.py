@@ -23,7 +23,7 @@ from rigidmd.forces.potentials.truncation import (
     truncation_terms,
 )  # fmt: skip
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import did_you_mean
+from rigidmd.scene.validation import did_you_mean, not_none
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -80,13 +80,13 @@ class PairLaw:
                 return formula_of_table(r, energy, cutoff, force, name)
             if isinstance(self.energy, str):
                 return formula_of_text(self.energy, self.constants)
-            assert self.formula_of_function is not None  # it has a text, a function or a table
-            return self.formula_of_function
         except FormulaError as error:
             raise PairPotentialError(str(error)) from None
+        return not_none(self.formula_of_function)
 
-    def bind(self, system: "System") -> "BoundPotential":
-        """The potential between the sites of a system. Raises PairPotentialError with all errors."""
+    def bind(self, system: "System") -> tuple[PairForces, Formula, Tail | None, list[str]]:
+        """The potential between the sites of a system: its term, formula, tail correction if the scene has it, notes.
+        Raises PairPotentialError with all errors."""
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
@@ -105,8 +105,8 @@ class PairLaw:
         index = system.model.species
         offsets = [m.positions_body[sites] for m, sites in zip(system.species, indices, strict=True)]
         sites = sites_of(index, offsets, system.model.inverse_inertia)
-        numbers_of = [[types.number[entry] for entry in entries if entry is not None] for entries in types.of_species]
-        kind = gather_per_molecule([np.array(values, int) for values in numbers_of], index)
+        kinds = [np.array([types.all.index(entry) for entry in entries if entry], int) for entries in types.of_species]
+        kind = gather_per_molecule(kinds, index)
         shape = truncation_of(name, cutoff, start)
         count = len(types.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
@@ -145,12 +145,9 @@ class PairLaw:
             acts,
         )  # fmt: skip
         frozen = (system.model.inverse_mass == 0)[index]
-        return BoundPotential(
-            pair_forces(potential, sites, exclusion_groups(sites, frozen)),
-            formula,
-            beyond if forces.tail_correction else None,
-            [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else [],
-        )
+        term = pair_forces(potential, sites, exclusion_groups(sites, frozen))
+        notes = [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else []
+        return term, formula, beyond if forces.tail_correction else None, notes
 
 
 def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
@@ -178,15 +175,6 @@ def check_cutoff(cutoff: float, system: "System") -> None:
         raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
 
 
-class BoundPotential(NamedTuple):
-    """A pair potential in a system."""
-
-    term: PairForces
-    formula: Formula
-    tail: Tail | None  # correction for the cutoff, if the scene has forces.tail_correction
-    notes: list[str]
-
-
 class _SiteTypes:
     """Types of sites: a type has the same parameters and is in the same entries of `pairs`."""
 
@@ -206,7 +194,10 @@ class _SiteTypes:
             faults += [f"{where}: {self._unknown(name)}" for name in given if name not in formula.parameters]
         if potential.of_sites == {} and not potential.pairs:
             faults += [f"there is no {name} among its parameters" for name in self._needed]
-        faults += [self._unknown(name) for name in potential.constants if not _has(potential.energy, formula, name)]
+        # the formula may have the number of a constant in place of its name
+        text = potential.energy if isinstance(potential.energy, str) else ""
+        there_too = {*formula.parameters, *re.findall(r"[^\W\d]\w*", text)}
+        faults += [self._unknown(name) for name in potential.constants if name not in there_too]
         faults += [f"mixing: {self._unknown(name)}" for name in potential.mixing if name not in formula.parameters]
         twice = [pair for pair in potential.pairs if pair[0] < pair[1] and pair[::-1] in potential.pairs]
         faults += [f"pairs: {'-'.join(pair)} is given twice" for pair in twice]
@@ -214,7 +205,6 @@ class _SiteTypes:
             raise PairPotentialError(*faults)
         self.of_species = [[self._kind(k, m, i) for i in range(len(m.masses))] for k, m in enumerate(species)]
         self.all = sorted({entry for sites in self.of_species for entry in sites if entry is not None}, key=repr)
-        self.number = {entry: k for k, entry in enumerate(self.all)}
         self._first = {
             entry: f"{m.name}.{m.site_names[i]}"
             for m, sites in reversed(list(zip(species, self.of_species, strict=True)))
@@ -232,12 +222,10 @@ class _SiteTypes:
 
     def _kind(self, k: int, m: Molecule, i: int) -> tuple | None:
         """Parameters of a site, and whether it is each site of `pairs`; None if the potential does not act on it."""
-        potential = self._potential
         given = self._parameters(k, m, i)
-        sides = tuple(bool(self._named[name][k][i]) for pair in potential.pairs for name in pair)
-        if given is None and not any(sides):
-            return None
-        return (None if given is None else tuple(sorted(given.items()))), sides
+        sides = tuple(bool(self._named[name][k][i]) for pair in self._potential.pairs for name in pair)
+        acts = given is not None or any(sides)
+        return (None if given is None else tuple(sorted(given.items())), sides) if acts else None
 
     def _parameters(self, k: int, m: Molecule, i: int) -> Parameters | None:
         potential = self._potential
@@ -261,7 +249,7 @@ class _SiteTypes:
                 found = None
                 for n, values in enumerate(self._potential.pairs.values()):
                     if (sides[2 * n] and others[2 * n + 1]) or (sides[2 * n + 1] and others[2 * n]):
-                        found = {"scale": 1.0} | dict(values) if self._formula.shared else dict(values)
+                        found = ({"scale": 1.0} if self._formula.shared else {}) | dict(values)
                 if found is None and given is not None and other is not None:
                     found = self._mixed(dict(given), dict(other), i, j, faults)
                 if found is not None:
@@ -270,11 +258,10 @@ class _SiteTypes:
     def _mixed(self, given: dict, other: dict, i: int, j: int, faults: list[str]) -> dict[str, float] | None:
         found = {}
         for name, a in given.items():
-            b = other[name]
-            rule = self._potential.mixing.get(name) or ("arithmetic" if name.lower().startswith("sig") else "geometric")
+            b, usual = other[name], "arithmetic" if name.lower().startswith("sig") else "geometric"
             if a == b:
                 found[name] = a
-            elif rule == "arithmetic":
+            elif (rule := self._potential.mixing.get(name, usual)) == "arithmetic":
                 found[name] = (a + b) / 2
             elif rule == "geometric" and a * b >= 0:
                 found[name] = sqrt(a * b) * (-1.0 if a < 0 or b < 0 else 1.0)
@@ -287,11 +274,6 @@ class _SiteTypes:
                 )
                 return None
         return found
-
-
-def _has(energy: Any, formula: Formula, name: str) -> bool:
-    """Whether a formula contains a parameter, which may have been replaced by its number."""
-    return name in formula.parameters or (isinstance(energy, str) and name in re.findall(r"[^\W\d]\w*", energy))
 
 
 def pair_law(
@@ -330,13 +312,11 @@ def pair_law(
     for what, given in (("mixing", mixing), ("pairs", pairs)):
         if given is not None and not isinstance(given, Mapping):
             raise ValueError(f"{what} is {given!r:.60}, must be a dictionary")
-    columns = None
-    if isinstance(table, str | Path):
-        columns = read_columns(Path(table))
-    elif table is not None:
+    columns = read_columns(Path(table)) if isinstance(table, str | Path) else None
+    if columns is None and table is not None:
         if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
             raise ValueError("table must be a file, or lists: distances in Å, energies in kJ/mol, perhaps forces")
-        columns = Columns(table[0], table[1], table[2] if len(table) > 2 else None)
+        columns = Columns(*table)
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
     for parameter, rule in (mixing or {}).items():
