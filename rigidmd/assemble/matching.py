@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Hashable, Iterable
+from functools import cache
 from itertools import groupby
 from math import inf
 from typing import Any, NamedTuple
@@ -110,8 +111,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     for molecule in species:
         for name, label, mass in zip(molecule.site_names, _labels(molecule), molecule.masses, strict=True):
             by_name.setdefault(name, set()).add(label if mass > 0 else "X")
-            if mass > 0:
-                by_mass.append((mass, label))
+            by_mass += [(mass, label)] if mass > 0 else []
     vocabulary = frozenset(label for _, label in by_mass)
     open_names = {name for name, labels in by_name.items() if len(labels) > 1}
     by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
@@ -119,14 +119,14 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     points = {name: _labels(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
     shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
     virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
-    known = {}
     hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
 
     def isotope(element: str) -> str:
         """The isotope of hydrogen in the scene, for others in the file: light water from a file of heavy water."""
         return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
 
-    def kind(name: str, element: str, mass: float, residue: tuple) -> str:
+    @cache
+    def kind(name: str, element: str, mass: float, residue: str | None) -> str:
         if 0 < mass < NO_MASS:
             return "X"
         if mass > 0:
@@ -147,22 +147,17 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
             return isotope(element)
         if name in open_names:
             return f"{name}?"
-        if residue and residue[1] in points and residue[1] not in shared:
-            return points[residue[1]]
-        if not residue or residue[1] == name:  # an ion or a noble gas: NA, CL, AR, SOD
+        if residue in points and residue not in shared:
+            return points[residue]
+        if residue in (None, name):  # an ion or a noble gas: NA, CL, AR, SOD
             ion = CHARMM_IONS.get(name.upper(), "")
-            name = ion if ion in vocabulary else name.capitalize() if residue else name
+            name = ion if ion in vocabulary else name if residue is None else name.capitalize()
         guess = isotope(element_of(name, vocabulary))
         return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
 
-    found = []
     masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
-    for name, element, mass, residue in zip(atoms.names, atoms.elements, masses, atoms.residue, strict=True):
-        key = (name, element, mass, residue[1:2])
-        if key not in known:
-            known[key] = kind(name, element, mass, residue)
-        found.append(known[key])
-    return found
+    residues = [residue[1] if residue else None for residue in atoms.residue]
+    return [kind(*atom) for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)]
 
 
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
@@ -207,15 +202,22 @@ def _match_groups(
     atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
 ) -> MatchedMolecules | list[str]:
     """Each run of atoms as one molecule. Runs of one composition are fitted together. how : text for messages."""
-    alike = {}
+
+    def described(number: int) -> str:
+        run = runs[number]
+        listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
+        if run == list(range(run[0], run[-1] + 1)):
+            listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
+        residue = f", residue {atoms.residue[run[0]][1]!r}" if "".join(atoms.residue[run[0]][1:2]) else ""
+        return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
+
+    alike, faults, n = {}, {}, len(runs)
     for number, run in enumerate(runs):
         residue = atoms.residue[run[0]]
         key = (residue[1] if residue else "", tuple(atoms.names[i] for i in run), tuple(kinds[i] for i in run))
         alike.setdefault(key, []).append(number)
-    n = len(runs)
     fit = TemplateFit(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n))
     found = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, massless=Counter(), notes=[])
-    faults = {}
     for (residue, names, run_kinds), members in alike.items():
         named = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
         eligible = named or list(range(len(species)))
@@ -231,18 +233,10 @@ def _match_groups(
             by_shape = species[found.species[members[0]]].name
             found.notes.append(f"the names of atoms {listed} are no elements: assigned to {by_shape} by shape")
     if faults:
-        return [f"{_describe_group(atoms, runs[m], m, how)} {fault}" for m, fault in sorted(faults.items())]
+        return [f"{described(m)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
     found.massless.update(atoms.names[i] for i in others)
     return found
-
-
-def _describe_group(atoms: Atoms, run: list[int], number: int, how: str) -> str:
-    listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
-    if run == list(range(run[0], run[-1] + 1)):
-        listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
-    residue = f", residue {atoms.residue[run[0]][1]!r}" if "".join(atoms.residue[run[0]][1:2]) else ""
-    return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
 
 
 def _formula(elements) -> str:
@@ -311,14 +305,13 @@ def _fit_group(
             names = " or ".join(species[candidates[k].species].name for k in fitting)
             faults[m] = f"may be {names}: give them residue_names in the scene"
         else:
-            off = [fit.deviation[row] for _, fit in fits]
-            if len(faults) < MOST_SEARCHED:  # of the best order
-                points = [_make_whole(atoms.position[order[row]][None], cell)[0] for order, _ in fits]
-                tried = zip(points, candidates, limits, off, strict=True)
-                off = [
-                    _least_deviation(p, species[c.species], c.allowed[-1], limit, there) for p, c, limit, there in tried
-                ]
-            k = int(np.argmin(np.array(off) / limits))
+            off = np.array([fit.deviation[row] for _, fit in fits])
+            for k, c in enumerate(candidates if len(faults) < MOST_SEARCHED else ()):  # of the best order found
+                points = _make_whole(atoms.position[fits[k][0][row]][None], cell)
+                molecule, wide = species[c.species], SEARCH_TOLERANCE * limits[k]
+                if (best := _search_order(points[0], molecule, c.allowed[-1], wide, MOST_TRIES // 10)) is not None:
+                    off[k] = min(off[k], _fit(points[:, best], molecule).deviation[0])
+            k = int(np.argmin(off / limits))
             faults[m] = (
                 f"is not {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, "
                 f"more than {limits[k]:.3f} Å (structure.tolerance)"
@@ -350,14 +343,6 @@ def _fit_in_any_order(
                 fits[0] = True  # even if rounding puts it just above the limit
                 bad = bad[~fits]
     return fit
-
-
-def _least_deviation(
-    points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, deviation: float
-) -> float:
-    """The deviation of the atoms (s, 3) of a molecule in the best order found, for messages."""
-    order = _search_order(points, molecule, allowed, SEARCH_TOLERANCE * limit, MOST_TRIES // 10)
-    return deviation if order is None else min(deviation, float(_fit(points[None, order], molecule).deviation[0]))
 
 
 def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:

@@ -189,17 +189,15 @@ def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecul
     """A note if masses in the file and in the scene differ."""
     if atoms.masses is None:
         return []
-    different = {}
+    others = {}
     for k, molecule in enumerate(species):
         for s, site in enumerate(massive_sites(molecule)):
             members = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
             mass = float(molecule.masses[site])
             for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
-                different[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
-    note = (
-        f"the masses of the scene are used, not the masses in the file ({'; '.join(different)}): masses_u changes them"
-    )
-    return [note] if different else []
+                others[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
+    note = f"the masses of the scene are used, not the masses in the file ({'; '.join(others)}): masses_u changes them"
+    return [note] if others else []
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
