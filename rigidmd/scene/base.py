@@ -176,33 +176,23 @@ class Scene(Section, Displayed):
             f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in numbers_out_of_range(data, *kind.SIZES)
         ]
         faults += kind.contradictions(data, text)
-
-        def refusal(found: list[str]) -> SceneError:
-            return SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in found])
-
+        whole, rows = with_registered_rows(data)
+        scene = None
         try:
-            whole, rows = with_registered_rows(data)
             scene = kind.model_validate(whole, context=rows)
         except ValidationError as error:
-            raise refusal(faults + validation_messages(error, kind, text, overridden)) from None
-        if faults:
-            raise refusal(faults)
-        scene._source = source
-        scene._folder = folder
-        scene._embedded_files = embedded_files or {}
-        if missing := scene._missing_files(text, overridden):
-            raise SceneError(source, missing)
-        return scene
-
-    def _missing_files(self, text: str, overridden: Iterable[str]) -> list[str]:
-        """Messages on missing files, with line and key."""
-        faults = []
-        for key, path in self.inputs.items():
+            faults += validation_messages(error, kind, text, overridden)
+        if scene is None or faults:
+            raise SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in faults])
+        scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
+        for key, path in scene.inputs.items():
             if fault := unreadable_reason(path):
                 keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
                 where = location_of(keys, text, overridden)
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
-        return faults
+        if faults:
+            raise SceneError(source, faults)
+        return scene
 
 
 def read_tables(path: Path) -> tuple[dict[str, Any], str]:
@@ -286,7 +276,9 @@ def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
         listed, table = isinstance(target, list), isinstance(target, dict)
         number = parse_whole_number(part)
         if listed:
-            names = [_name_of_entry(entry) for entry in target]
+            # of a stage its name or ensemble, of molecules their name or model
+            named = [[e[k] for k in ("name", "ensemble", "model") if isinstance(e, dict) and k in e] for e in target]
+            names = [found[0] if found else "" for found in named]
             if number is None and names.count(part) == 1:
                 number = names.index(part)
             if number is None or number >= len(target):
@@ -308,12 +300,6 @@ def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
         else:
             target = target[index]
     return ".".join(map(str, indices)), []
-
-
-def _name_of_entry(entry: Any) -> Any:
-    """The name of an entry of a list: of a stage its name or ensemble, of molecules their name or model."""
-    keys = [key for key in ("name", "ensemble", "model") if isinstance(entry, dict) and key in entry]
-    return entry[keys[0]] if keys else ""
 
 
 def parse_override(text: str) -> tuple[str, Any]:

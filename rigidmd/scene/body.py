@@ -7,7 +7,7 @@ The equations contain no physical constants, so any other consistent units work 
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import Field, Strict, field_validator
 
 from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY, written
@@ -68,14 +68,10 @@ class Solid(Section):
         """The dimensions given."""
         return {key: value for key in COMPONENTS_PER_DIMENSION if (value := getattr(self, key)) is not None}
 
-    @model_validator(mode="after")
-    def _has_its_dimensions(self):
+    def _errors(self):
         wanted, given = set(SOLIDS[self.shape].dimensions), set(self.dimensions)
         if wanted != given:
-            raise ValueError(
-                f"a {self.shape} has {' and '.join(sorted(wanted))}, not {' and '.join(sorted(given)) or 'none'}"
-            )
-        return self
+            yield f"a {self.shape} has {' and '.join(sorted(wanted))}, not {' and '.join(sorted(given)) or 'none'}"
 
 
 class PointMass(Section):
@@ -125,12 +121,9 @@ class BodyTable(Section):
                 about_pivot and ways[:1] in (["solid"], ["points"])
             ),
         }
-        return [fault for fault, is_there in faults.items() if is_there] or self._impossible()
-
-    def _impossible(self) -> list[str]:
-        tensor = self.tensor
-        if tensor is None or self.mass_kg is None:
-            return []
+        found, tensor = [fault for fault, is_there in faults.items() if is_there], self.tensor
+        if found or tensor is None or self.mass_kg is None:
+            return found
         if np.abs(tensor - tensor.T).max() > 1e-12 * np.abs(tensor).max():
             return ["inertia_tensor_kg_m2 is not symmetric"]
         if why := inertia_error(tensor):
@@ -311,13 +304,11 @@ class BodyOutput(Section):
     def _topology_name(cls, name: str | None):
         return name if name is None else file_name(name, written(lambda form: form.write_topology))
 
-    @model_validator(mode="after")
-    def _files_differ(self):
+    def _errors(self):
         if self.trajectory and self.trajectory == (self.topology or BODY_TOPOLOGY):
-            raise ValueError(f"topology and trajectory are both {self.trajectory}; give them different names")
+            yield f"topology and trajectory are both {self.trajectory}; give them different names"
         if self.axis is not None and not any(self.axis):
-            raise ValueError("axis is zero, which is not a direction")
-        return self
+            yield "axis is zero, which is not a direction"
 
 
 class BodyWatch(Section):

@@ -51,18 +51,16 @@ class _Engine(Section):
         return self.program.describe(**self.options) if self.program else self.name
 
 
-def _fields() -> dict[str, Any]:
-    """The options of all engines as fields of a model."""
-    options = engine_options()
-    kinds: dict[str, Any] = {
-        key: Count if option.values is int else Literal[option.values] for key, option in options.items()
-    }
-    return {key: (kinds[key] | None, Field(None, description=options[key].description)) for key in options}
-
-
 if TYPE_CHECKING:
     EngineChoice = _Engine
 else:
+    _FIELDS = {
+        key: (
+            (Count if option.values is int else Literal[option.values]) | None,
+            Field(None, description=option.description),
+        )
+        for key, option in engine_options().items()
+    }
     EngineChoice = create_model(
-        "EngineChoice", __base__=_Engine, __module__=__name__, __doc__=_Engine.__doc__, **_fields()
+        "EngineChoice", __base__=_Engine, __module__=__name__, __doc__=_Engine.__doc__, **_FIELDS
     )

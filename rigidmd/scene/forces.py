@@ -3,7 +3,7 @@
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, Strict, model_validator
+from pydantic import Field, Strict
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.scene.models import Mixing
@@ -95,20 +95,18 @@ class CustomForce(Section):
     switch_start_A: Positive | None = None
     """With an energy: where a switch begins; default: forces.switch_start_A"""
 
-    @model_validator(mode="after")
-    def _is_one_kind(self):
+    def _errors(self):
         if sum(given is not None for given in (self.module, self.energy, self.table)) != 1:
-            raise ValueError(
+            yield (
                 "give a module, a Python file with the force, an energy, a formula of r, or a table, a file of energies"
             )
         if self.module is not None:
             of_energy = ("sites", "pairs", "mixing", "truncation", "cutoff_A", "switch_start_A")
             idle = [key for key in of_energy if getattr(self, key) not in (None, (), {})]
             if idle:
-                raise ValueError(f"{', '.join(idle)} would do nothing with a module: its object has `parameters`")
+                yield f"{', '.join(idle)} would do nothing with a module: its object has `parameters`"
             if not self.module.endswith(".py"):
-                raise ValueError(f"module = {shorten_repr(self.module)} must be a Python file (.py)")
-        return self
+                yield f"module = {shorten_repr(self.module)} must be a Python file (.py)"
 
 
 class Forces(Section):
@@ -164,22 +162,20 @@ class Forces(Section):
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 
-    @model_validator(mode="after")
-    def _nothing_idle(self):
+    def _errors(self):
         if self.switch_start_A is not None and "switch" not in self.truncation:
-            raise ValueError(f"switch_start_A would do nothing with truncation = {self.truncation!r}")
+            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}"
         fields, used = type(self).model_fields, ELECTROSTATICS[self.electrostatics].keys
         for key in dict.fromkeys(key for method in ELECTROSTATICS.values() for key in method.keys):
             if key not in used and getattr(self, key) != fields[key].default:
-                raise ValueError(f"{key} would do nothing with electrostatics = {self.electrostatics!r}")
+                yield f"{key} would do nothing with electrostatics = {self.electrostatics!r}"
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
-            raise ValueError("ewald_k2_max needs ewald_k_max too")
+            yield "ewald_k2_max needs ewald_k_max too"
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
-            raise ValueError("give ewald_k2_max or ewald_k_radius_per_A, not both")
+            yield "give ewald_k2_max or ewald_k_radius_per_A, not both"
         determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
-            raise ValueError("ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given")
-        return self
+            yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
 
     @property
     def sets_k_vectors(self) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from rigidmd.core.toml import impossible_values, read_toml
 from rigidmd.errors import MoleculeError
@@ -61,14 +61,12 @@ class Site(Section):
     parameters: dict[str, Number] = Field(default={}, max_length=MOST_PARAMETERS)
     """Parameters of custom pair potentials, by name"""
 
-    @model_validator(mode="after")
-    def _lennard_jones_is_whole(self):
+    def _errors(self):
         given = [key for key in DEPTHS if getattr(self, key) is not None]
         if len(given) > 1:
-            raise ValueError(f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}")
+            yield f"give one of {', '.join(given)}, not {'both' if len(given) == 2 else 'all'}"
         if bool(given) != (self.sigma_A is not None):
-            raise ValueError(f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}")
-        return self
+            yield f"a Lennard-Jones site needs both sigma_A and one of {', '.join(DEPTHS)}"
 
     @property
     def epsilon(self) -> float:

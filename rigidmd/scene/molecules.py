@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
-from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
+from pydantic import Field, PrivateAttr, Strict, field_validator
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
@@ -109,16 +109,12 @@ class Output(Section):
     def _topology_name(cls, name: str):
         return file_name(name, written(lambda form: form.write_topology))
 
-    @model_validator(mode="after")
-    def _files_are_consistent(self):
+    def _errors(self):
         if self.velocities and not self.can_store_velocities:
             formats = f"use a {' or '.join(written(lambda form: form.velocities))} file"
-            raise ValueError(
-                f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; {formats}"
-            )
+            yield f"velocities = true, but {self.trajectory or 'no trajectory'} cannot store them; {formats}"
         if self.topology == self.trajectory:
-            raise ValueError(f"topology and trajectory are both {self.topology}; give them different names")
-        return self
+            yield f"topology and trajectory are both {self.topology}; give them different names"
 
     @property
     def can_store_velocities(self) -> bool:
@@ -294,7 +290,15 @@ class MolecularScene(Scene):
         rescaled = first is not None and first.has_thermostat and first.keeps_momentum
         if self.start.temperature_K == 0 and rescaled:
             yield "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest"
-        yield from self._barostat_errors()
+        reasons = {
+            "box.periodic is false": not self.box.periodic,
+            "frozen molecules do not move: release them, or keep the volume": any(m.frozen for m in self.molecules),
+            "fields.walls do not move: keep the volume": self.fields.walls,
+            "fields.restraints fix positions: keep the volume": self.fields.restraints,
+        }
+        for k, stage in enumerate(self.stages):
+            what = f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box"
+            yield from [f"{what}, but {why}" for why, applies in reasons.items() if stage.changes_box and applies]
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
@@ -304,22 +308,6 @@ class MolecularScene(Scene):
             yield f"forces.switch_start_A = {start:g} is not below cutoff_A = {cutoff:g}"
         yield from field_errors(self)
         yield from self._uneven_frames()
-
-    def _barostat_errors(self) -> list[str]:
-        """Messages on stages with a barostat."""
-        reasons = {
-            "box.periodic is false": not self.box.periodic,
-            "frozen molecules do not move: release them, or keep the volume": any(m.frozen for m in self.molecules),
-            "fields.walls do not move: keep the volume": self.fields.walls,
-            "fields.restraints fix positions: keep the volume": self.fields.restraints,
-        }
-        return [
-            f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box, but {reason}"
-            for k, stage in enumerate(self.stages)
-            if stage.changes_box
-            for reason, applies in reasons.items()
-            if applies
-        ]
 
     def rounded_times(self, stages: Sequence[int] | None = None) -> list[str]:
         """Notes on intervals and durations that are not a whole number of steps, of all stages or these."""

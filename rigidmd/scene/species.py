@@ -1,4 +1,4 @@
-"""The tables [[molecules]] of a scene: species and their numbers of molecules."""
+"""Tables of a scene of molecules: [[molecules]], the species and their numbers; [structure], [box] and [start]."""
 
 import re
 from math import cos, pi, radians, sqrt
@@ -130,17 +130,15 @@ class Structure(Section):
     """Site name or element of each atom type in LAMMPS data files, dumps and .xyz files: { 1 = "O", 2 = "H" }; X has no
     mass. Default: labels or elements in the file, else masses"""
 
-    @model_validator(mode="after")
-    def _needs_names(self):
+    def _errors(self):
         if self.topology is None:
-            return self
+            return
         nameless = extensions(lambda form: form.read_arrays)
         if not self.file.lower().endswith(nameless):
-            raise ValueError(f"topology is for trajectories without names ({' '.join(nameless)}), not for {self.file}")
+            yield f"topology is for trajectories without names ({' '.join(nameless)}), not for {self.file}"
         if self.topology.lower().endswith((*extensions(lambda form: form.is_trajectory), ".npz")):
             with_names = ", ".join(extensions(lambda form: form.write_topology))
-            raise ValueError(f"topology = {self.topology!r}: name a structure file with names of atoms ({with_names})")
-        return self
+            yield f"topology = {self.topology!r}: name a structure file with names of atoms ({with_names})"
 
 
 class Box(Section):
@@ -155,15 +153,14 @@ class Box(Section):
     periodic: Flag = True
     """Periodic boundary conditions; false: molecules in vacuum without a box"""
 
-    @model_validator(mode="after")
-    def _one_size(self):
+    def _errors(self):
         if self.lengths_A is not None and self.density_g_cm3 is not None:
-            raise ValueError("give lengths_A or density_g_cm3, not both")
+            yield "give lengths_A or density_g_cm3, not both"
         if self.angles_deg is not None and self.lengths_A is None:
-            raise ValueError("angles_deg needs lengths_A")
-        if self.angles_deg is not None and not _span_a_volume(*map(radians, self.angles_deg)):
-            raise ValueError("angles_deg: three edges cannot form these angles")
-        return self
+            yield "angles_deg needs lengths_A"
+        angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
+        if not 2 * max(angles) < sum(angles) < 2 * pi:  # the edges would be in one plane, or could not meet
+            yield "angles_deg: three edges cannot form these angles"
 
     @property
     def cell(self) -> np.ndarray | None:
@@ -175,11 +172,6 @@ class Box(Section):
         across = sqrt(1 - gamma**2)
         y = (alpha - beta * gamma) / across
         return np.array([[a, 0, 0], [b * gamma, b * across, 0], [c * beta, c * y, c * sqrt(1 - beta**2 - y**2)]])
-
-
-def _span_a_volume(alpha: float, beta: float, gamma: float) -> bool:
-    """Whether three edges can form these angles (radians) without lying in one plane."""
-    return 2 * max(alpha, beta, gamma) < alpha + beta + gamma < 2 * pi
 
 
 class Start(Section):

@@ -128,8 +128,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"an {self.ensemble} stage needs temperature_K"
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
-        if idle := [key for key in type(self).model_fields if self._is_given(key) and not self._uses(key)]:
-            yield f"{', '.join(idle)} would do nothing {self._where(idle)}"
+        parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
+        parts |= {CELL} if self.is_minimisation and self.changes_box else set()
+        given = {key: _users(key) for key in type(self).model_fields if self._is_given(key)}
+        if idle := {key: users for key, users in given.items() if users and users.isdisjoint(parts)}:
+            yield f"{', '.join(idle)} would do nothing {self._where(list(idle.values()))}"
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
@@ -137,9 +140,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.has_barostat:
             yield from self._barostat_errors()
         yield from self._rotor_errors()
-        given = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
-        yield from auto_errors(self.integrator, targets, given)
+        yield from auto_errors(self.integrator, targets, [key for key in ("timestep_fs", "rotor") if key in given])
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
@@ -150,20 +152,17 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
 
-    def _uses(self, key: str) -> bool:
-        users, parts = _users(key), {self.ensemble, self.thermostat_kind, self.barostat_kind}
-        return not users or not users.isdisjoint(parts | {CELL} if self.is_minimisation and self.changes_box else parts)
-
-    def _where(self, idle: list[str]) -> str:
-        """The settings with which keys would do nothing, for the message."""
-        users = [_users(key) for key in idle]
+    def _where(self, users: list[set[str]]) -> str:
+        """The settings with which keys that have these users would do nothing, for the message."""
         if self.is_minimisation:
-            return "in a minimise stage" + (" without pressure_bar" if all(CELL in kinds for kinds in users) else "")
-        if any(self.ensemble not in _ensembles(kinds) for kinds in users):
-            return f"in an {self.ensemble} stage"
+            return "in a minimise stage" + (" without pressure_bar" if all(CELL in names for names in users) else "")
+        kinds = THERMOSTATS | BAROSTATS
+        for names in users:
+            if not any(self.ensemble in (kinds[name].ensembles if name in kinds else (name,)) for name in names):
+                return f"in an {self.ensemble} stage"
         concerned = set().union(*users)  # a key of the barostat does not depend on the thermostat
-        kinds = ((self.thermostat_kind, THERMOSTATS), (self.barostat_kind, BAROSTATS))
-        return f"with {' and '.join(kind for kind, among in kinds if kind and concerned & set(among))}"
+        parts = ((self.thermostat_kind, THERMOSTATS), (self.barostat_kind, BAROSTATS))
+        return f"with {' and '.join(kind for kind, among in parts if kind and concerned & set(among))}"
 
     def _pressure_errors(self):
         given, coupling = self.pressure_bar, self.pressure_coupling
@@ -319,12 +318,6 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 def _users(key: str) -> set[str]:
     """The ensembles, thermostats and barostats that use a key; none for the keys of every stage."""
     return USED.get(key, set()) | {name for name, kind in (THERMOSTATS | BAROSTATS).items() if key in kind.keys}
-
-
-def _ensembles(users: set[str]) -> set[str]:
-    """The ensembles among users of a key, or in which the thermostats and barostats among them act."""
-    kinds = THERMOSTATS | BAROSTATS
-    return {ensemble for name in users for ensemble in (kinds[name].ensembles if name in kinds else (name,))}
 
 
 def _tensor(given: Any) -> Six:

@@ -94,7 +94,8 @@ def validation_messages(
     for detail in error.errors(include_url=False):
         unknown = detail["type"] == "extra_forbidden"  # the last key is text of the user
         names = detail["loc"][:-1] if unknown else detail["loc"]
-        keys = [*(key for key in names if not _is_union_branch(key)), *(detail["loc"][-1:] if unknown else ())]
+        keys = [key for key in names if not (isinstance(key, str) and UNION_BRANCH.search(key))]
+        keys += detail["loc"][-1:] if unknown else ()
         if detail["type"] == "missing" and keys and isinstance(keys[-1], int):
             keys = keys[:-1]  # the list lacks an entry
         # Messages beyond the number shown are only counted.
@@ -141,11 +142,8 @@ def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
     return (f"line {line}: " if line else "") + (path or "scene")
 
 
-def _is_union_branch(key: Any) -> bool:
-    """Whether this part of a location of pydantic names the branch of a union."""
-    return isinstance(key, str) and bool(re.search(r"[\[(]|^(constrained-)?(float|int|bool|str)$", key))
-
-
+#: A part of a location of pydantic that names the branch of a union.
+UNION_BRANCH = re.compile(r"[\[(]|^(constrained-)?(float|int|bool|str)$")
 #: Messages by the type of pydantic's error.
 SENTENCES = {
     "missing": "is missing",
