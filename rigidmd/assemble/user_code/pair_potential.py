@@ -316,7 +316,7 @@ def pair_law(
     if columns is None and table is not None:
         if not (isinstance(table, tuple | list) and len(table) in (2, 3)):
             raise ValueError("table must be a file, or lists: distances in Å, energies in kJ/mol, perhaps forces")
-        columns = Columns(*table)
+        columns = Columns(table[0], table[1], table[2] if len(table) > 2 else None)
     if not isinstance(name, str):
         raise ValueError(f"name is {name!r:.60}, must be a text")
     for parameter, rule in (mixing or {}).items():
