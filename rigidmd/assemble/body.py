@@ -1,7 +1,7 @@
 """The system of a scene of a single body, and errors of keys that do not apply to the body or have no effect on it."""
 
 # isort: skip_file
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import permutations
 
 import numpy as np
@@ -28,7 +28,7 @@ from rigidmd.mechanics.time_functions import (
 from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, NoTranslation
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import axis_of_symmetry
-from rigidmd.scene.body_forces import Applied, Fluid, Friction, Timed
+from rigidmd.scene.body_forces import Fluid, Friction, Timed
 from rigidmd.scene.validation import not_none
 
 
@@ -46,40 +46,32 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         moments, axes = principal(tensor)
     moments = moments + added_inertia
     rotates, applied = bool(moments.any()), applied or {}
-    faults = body_errors(scene, centre, moments, axes, added_mass)
+    faults = [*_body_errors(scene, centre, moments, axes, added_mass)]
     attitude = scene.start.attitude
     spin = axes.T @ scene.start.angular_velocity  # along the principal axes
     without_inertia = (moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))
     if rotates and without_inertia.any():
         faults.append("start: the body rotates about an axis without inertia")
-    faults += integrator_errors(scene, bool(added_mass.any()), bool(applied))
+    faults += _integrator_errors(scene, bool(added_mass.any()), bool(applied))
     taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
-    faults += [
-        f"applied: {name!r} is the name of a force of the scene; choose another" for name in applied if name in taken
-    ]
-    for k, entry in enumerate(scene.applied):
-        faults += torque_errors(entry, k, axes, moments, rotates)
+    why = "is the name of a force of the scene; choose another"
+    faults += [f"applied: {name!r} {why}" for name in applied if name in taken]
+    faults += _torque_errors(scene, axes, moments)
     if faults:
         raise SceneError(scene.source, faults)
 
     scene = body_with_defaults(scene, rotates, float(np.linalg.norm(points, axis=1).max()))
     check_memory_of_samples(scene)
     rotor = rotor_of(scene, moments, added_inertia, axes) if rotates else NoRotor()
-    frame = frame_of(scene)
-    if scene.body.pinned:
-        translation = NoTranslation(mass)
-    elif added_mass.any():
+    translation = NoTranslation(mass) if scene.body.pinned else FreeTranslation(mass)
+    if added_mass.any() and not scene.body.pinned:
         translation = FluidTranslation(mass, mass + added_mass)
-    else:
-        translation = FreeTranslation(mass)
-    body = Body(translation, rotor, frame, resistance_of(scene))
-    terms = terms_of(scene, mass, axes, centre, displaced)
-    terms |= {name: PythonForce() for name in applied}
+    body = Body(translation, rotor, frame_of(scene), resistance_of(scene))
+    terms = terms_of(scene, mass, axes, centre, displaced) | {name: PythonForce() for name in applied}
     system = BodySystem(
         scene=scene, body=body, state=_first_state(scene, body, moments, axes, attitude, spin, rotates), terms=terms,
         mass=mass, axes=axes, inertia=moments, centre=centre, points=points, point_names=names, applied=applied,
     )  # fmt: skip
-    system.left_out = _left_out(system)
     if scene.output.trajectory and system.translates:
         form = not_none(format_of(not_none(scene.output.topology)))
         if form.exceeded(system.site_positions(system.state)) is not None:
@@ -92,8 +84,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     """The state at the start; spin (3,) along the principal axes, relative to the frame."""
-    start = scene.start
-    time = np.zeros(1)
+    start, time = scene.start, np.zeros(1)
     frame = np.zeros(3) if isinstance(body.frame, InertialFrame) else values_at(body.frame.angular_velocity, time)[0]
     position = velocity = np.zeros((0, 3))
     rotation, momentum = np.zeros((0, 3, 3)), np.zeros((0, 3))
@@ -112,60 +103,42 @@ def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:
     return state_of(position, velocity, rotation, momentum)
 
 
-def _left_out(system: BodySystem) -> list[str]:
-    """What is not compiled for this body, and why."""
-    body = system.body
-    reasons = {
-        "box, neighbour lists, pair forces, threads: there is one body": True,
-        "translation: the body is pinned": not system.translates,
-        "rotation: the body is a point": not system.rotates,
-        "frame: its axes do not rotate": isinstance(body.frame, InertialFrame),
-        "resistance: none": isinstance(body.resistance, NoResistance),
-        "wheels and changing inertia: none": not isinstance(body.rotor, DrivenRotor),
-        "forces: none": not system.terms,
-    }
-    return [reason for reason, applies in reasons.items() if applies]
-
-
-def body_errors(
+def _body_errors(
     scene: BodyScene, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, added_mass: np.ndarray
-) -> list[str]:
+) -> Iterator[str]:
     """Messages on keys of any table that do not apply to this body, or would have no effect on it."""
-    faults, body, fluid = [], scene.body, scene.fluid
-    rotates, along_axes = bool(moments.any()), np.array_equal(axes, np.eye(3))
+    fluid, rotates = scene.fluid, bool(moments.any())
     if not rotates:
-        faults += _rotation_keys_of_point(scene)
-        if body.pinned:
-            faults.append("body: a point at the pivot cannot move; give it inertia or a centre_of_mass_m")
+        yield from _rotation_keys_of_point(scene)
+        if scene.body.pinned:
+            yield "body: a point at the pivot cannot move; give it inertia or a centre_of_mass_m"
         if added_mass.any():
-            faults.append("fluid.added_mass_kg: a point carries no fluid along; leave it out")
+            yield "fluid.added_mass_kg: a point carries no fluid along; leave it out"
         for key in ("linear_resistance_kg_s", "quadratic_resistance_kg_m"):
             if fluid is not None and len(set(getattr(fluid, key))) > 1:
-                faults.append(f"fluid.{key}: a point has no axes: give three equal numbers")
-    elif added_mass.any():
-        for k in np.flatnonzero(moments == 0):
-            if added_mass[k - 1] != added_mass[k - 2]:
-                faults.append("fluid.added_mass_kg: a linear body has equal added masses across its axis")
-    if rotates and not along_axes:
-        faults += _keys_of_principal_axes(scene)
+                yield f"fluid.{key}: a point has no axes: give three equal numbers"
+    elif any(added_mass[k - 1] != added_mass[k - 2] for k in np.flatnonzero(moments == 0)):
+        yield "fluid.added_mass_kg: a linear body has equal added masses across its axis"
+    if rotates and not np.array_equal(axes, np.eye(3)):
+        yield from _keys_of_principal_axes(scene)
     if (scene.wheels or scene.changing_inertia) and rotates and not (moments > 0).all():
-        faults.append("wheels and changing_inertia need a body with inertia about every axis")
+        yield "wheels and changing_inertia need a body with inertia about every axis"
     if scene.output.drawn_as == "top" and rotates:
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
             shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
-            faults.append(
+            yield (
                 "output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are "
                 f"{shown} kg m²; name 'cuboid', 'ellipsoid' or a solid"
             )
-    if body.pinned:
+    if scene.body.pinned:
         if scene.changing_inertia is not None and centre.any():
-            faults.append("changing_inertia: the centre of mass must be at the pivot of a pinned body")
+            yield "changing_inertia: the centre of mass must be at the pivot of a pinned body"
         if scene.gravity is not None and not centre.any() and rotates:
-            faults.append("gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m")
-        idle = [k for k, entry in enumerate(scene.applied) if entry.force_N is not None and not any(entry.at_m or ())]
-        faults += [f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m" for k in idle]
-    return faults
+            yield "gravity does nothing to a body pinned at its centre of mass; give body.centre_of_mass_m"
+        for k, entry in enumerate(scene.applied):
+            if entry.force_N is not None and not any(entry.at_m or ()):
+                yield f"applied.{k}.force_N does nothing at the pivot; give its point of action, at_m"
 
 
 def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
@@ -183,37 +156,30 @@ def _rotation_keys_of_point(scene: BodyScene) -> list[str]:
     return [f"{key}: the body has no inertia: a point does not rotate" for key in idle]
 
 
-def _keys_of_principal_axes(scene: BodyScene) -> list[str]:
+def _keys_of_principal_axes(scene: BodyScene) -> Iterator[str]:
     """Messages on keys along the body's axes, which must be principal axes unless all three values are equal."""
-    faults = []
     for name, section in (("friction", scene.friction), ("fluid", scene.fluid)):
-        for key in type(section).model_fields if section else ():
-            value = getattr(section, key)
+        for key, value in section or ():
             if not isinstance(value, tuple) or key == "centre_of_buoyancy_m":
                 continue
             if len(set(value)) > 1 or (key == "dry_N_m" and any(value)):
-                faults.append(
-                    f"{name}.{key} is given along the body's axes, which are not principal axes of its inertia: "
-                    "give the body in its principal axes"
-                )
-    return faults
+                why = "which are not principal axes of its inertia: give the body in its principal axes"
+                yield f"{name}.{key} is given along the body's axes, {why}"
 
 
-def torque_errors(entry: Applied, k: int, axes: np.ndarray, moments: np.ndarray, rotates: bool) -> list[str]:
+def _torque_errors(scene: BodyScene, axes: np.ndarray, moments: np.ndarray) -> Iterator[str]:
     """Messages on torques about axes without inertia."""
-    if entry.torque_N_m is None and entry.at_m is None:
-        return []
-    if not rotates:
-        return [f"applied.{k}: a point has no inertia, and a torque cannot rotate it"]
-    if (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
-        torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
-        arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
-        if torques[:, moments == 0].any() or arm[moments > 0].any():
-            return [f"applied.{k}: nothing resists a torque about the axis of a linear body"]
-    return []
+    for k, entry in enumerate(scene.applied):
+        if not moments.any() and (entry.torque_N_m is not None or entry.at_m is not None):
+            yield f"applied.{k}: a point has no inertia, and a torque cannot rotate it"
+        elif (moments == 0).any() and (entry.axes == "body" or entry.at_m is not None):
+            torques = np.atleast_2d(entry.torque_N_m if entry.torque_N_m is not None else np.zeros(3)) @ axes
+            arm = axes.T @ np.array(entry.at_m or (0.0, 0.0, 0.0))
+            if torques[:, moments == 0].any() or arm[moments > 0].any():
+                yield f"applied.{k}: nothing resists a torque about the axis of a linear body"
 
 
-def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
+def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> list[str]:
     """Messages on integrators that cannot move this body, or lose their order; immersed: the fluid adds mass;
     has_functions: Python functions apply forces."""
     run, resistance = scene.run, resistance_of(scene)
@@ -221,10 +187,8 @@ def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> 
     if run.is_auto:
         return []
     if run.integrator in SOLVERS:
-        if resisted and resistance.rotation_dry.any():
-            what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
-            return [f"run: {what}: use velocity_verlet"]
-        return []
+        what = f"dry friction is discontinuous where a body stops, which {run.integrator} cannot resolve"
+        return [f"run: {what}: use velocity_verlet"] if resisted and resistance.rotation_dry.any() else []
     scheme = run.scheme
     if resisted and min(scheme.kicks) < 0:
         forward = ", ".join(name for name, other in SCHEMES.items() if min(other.kicks) >= 0)
@@ -237,12 +201,8 @@ def integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) -> 
         ]
     frame = frame_of(scene)
     axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
-    why = {
-        "wheels": scene.wheels,
-        "changing_inertia": scene.changing_inertia,
-        "added mass": immersed,
-        "a frame that changes its axis": axis_changes,
-    }
+    why = {"wheels": scene.wheels, "changing_inertia": scene.changing_inertia, "added mass": immersed}
+    why["a frame that changes its axis"] = axis_changes
     split = [name for name, other in SCHEMES.items() if not other.exact_rotor]
     return [
         f"run: the free motion of a body with {what} has no exact flow: {run.integrator} would be of order 2; "

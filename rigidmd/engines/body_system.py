@@ -1,7 +1,7 @@
 """The system of a scene of a single body, which an engine moves."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from rigidmd.engines.ode.engine import OdeEngine
 from rigidmd.engines.system import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.frame import InertialFrame
+from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.forces.neighbors.space import Unbounded
 from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.inertia import BodyKind, kind_of_body
@@ -55,7 +56,6 @@ class BodySystem:
     points: np.ndarray
     point_names: tuple[str, ...]
     applied: dict[str, Callable]
-    left_out: list[str] = field(default_factory=list)
     space = Unbounded()
 
     def __repr__(self) -> str:
@@ -74,6 +74,20 @@ class BodySystem:
                     f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: {used:g} s is used"
                 )
         return found
+
+    @property
+    def left_out(self) -> list[str]:
+        """What is not compiled for this body, and why."""
+        reasons = {
+            "box, neighbour lists, pair forces, threads: there is one body": True,
+            "translation: the body is pinned": not self.translates,
+            "rotation: the body is a point": not self.rotates,
+            "frame: its axes do not rotate": isinstance(self.body.frame, InertialFrame),
+            "resistance: none": isinstance(self.body.resistance, NoResistance),
+            "wheels and changing inertia: none": not isinstance(self.body.rotor, DrivenRotor),
+            "forces: none": not self.terms,
+        }
+        return [reason for reason, applies in reasons.items() if applies]
 
     @property
     def rotates(self) -> bool:
@@ -104,23 +118,20 @@ class BodySystem:
         found = Solver(run.integrator, run.formulation or FORMULATION, run.duration_s)
         if run.integrator == RK4:
             return found
-        return found._replace(
-            relative_tolerance=not_none(run.relative_tolerance), absolute_tolerance=not_none(run.absolute_tolerance)
-        )
+        relative, absolute = not_none(run.relative_tolerance), not_none(run.absolute_tolerance)
+        return found._replace(relative_tolerance=relative, absolute_tolerance=absolute)
 
     def engine(self) -> CpuEngine:
         """A new engine for this body at time 0, which calls the functions in `applied`."""
         kind = OdeEngine if self.scene.run.integrator in SOLVERS else CpuEngine
-        return kind(
-            *self.terms_at(0.0), python_forces={name: self._load_function(f) for name, f in self.applied.items()}
-        )
+        python_forces = {name: self._load_function(function) for name, function in self.applied.items()}
+        return kind(*self.terms_at(0.0), python_forces=python_forces)
 
     def breaks(self) -> list[float]:
         """Times within the run at which a prescribed function of time has a jump or a kink."""
-        run, components = self.scene.run, (*self.body, *self.terms.values())
-        functions = [value for part in components for value in part if isinstance(value, TimeFunction)]
-        times = {float(t) for function in functions for t in function.times}
-        return sorted(t for t in times if 0 < t < run.steps * run.timestep_s)
+        end, parts = self.scene.run.steps * self.scene.run.timestep_s, (*self.body, *self.terms.values())
+        functions = [value for part in parts for value in part if isinstance(value, TimeFunction)]
+        return sorted({float(t) for function in functions for t in function.times if 0 < t < end})
 
     def terms_at(self, time: float) -> tuple[Body, dict[str, NamedTuple]]:
         """Body and terms from a time to the next break."""

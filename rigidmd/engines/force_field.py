@@ -5,6 +5,7 @@ terms that rigidmd itself runs, so that mixing rules, special pairs and truncati
 `unknown_terms` lists what no other program can express.
 """
 
+from itertools import product
 from math import inf
 from typing import Any, NamedTuple, TypeVar
 
@@ -107,7 +108,11 @@ def force_field_of(system: System) -> ForceFieldView:
     kinds = [SiteKind(name, *of_kind[:3]) for of_kind, name in first.items()]
     of_species = [np.array([order[of_site] for of_site in of_sites]) for of_sites in parameters]
     lennard_jones = _potential(system, "lennard_jones", LennardJones)
-    sigma, epsilon = _pairs([of_kind[3] for of_kind in first], lennard_jones)
+    sigma, epsilon = np.ones((len(first), len(first))), np.zeros((len(first), len(first)))
+    for (i, one), (j, other) in product(enumerate(of_kind[3] for of_kind in first), repeat=2):
+        if lennard_jones and one >= 0 and other >= 0 and lennard_jones.c6[one, other] != 0:
+            c12, c6 = lennard_jones.c12[one, other], lennard_jones.c6[one, other]
+            sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
     coulomb = _potential(system, "coulomb", ReactionField) or _potential(system, "coulomb", DampedShiftedForce)
     return ForceFieldView(
         system, kinds, gather_per_molecule(of_species, index), (system.model.inverse_mass == 0)[index], sigma, epsilon,
@@ -145,29 +150,11 @@ def _lennard_jones_kinds(system: System) -> list[list[int]]:
     if law is None or not isinstance(term, PairForces):
         return found
     sites = term.sites
-    for k, m in enumerate(system.species):
-        members = np.flatnonzero(system.model.species == k)
-        if len(members) == 0:
-            continue
-        first = slice(sites.first[members[0]], sites.first[members[0] + 1])
-        for kind, offset in zip(law.kind[first], sites.offsets()[first], strict=True):
-            found[k][int(np.linalg.norm(m.positions_body - offset, axis=1).argmin())] = int(kind)
+    for k, member in zip(*np.unique(system.model.species, return_index=True), strict=True):
+        of_member, positions = slice(sites.first[member], sites.first[member + 1]), system.species[k].positions_body
+        for kind, offset in zip(law.kind[of_member], sites.offsets()[of_member], strict=True):
+            found[k][int(np.linalg.norm(positions - offset, axis=1).argmin())] = int(kind)
     return found
-
-
-def _pairs(kinds: list[int], law: LennardJones | None) -> tuple[np.ndarray, np.ndarray]:
-    """sigma and epsilon between Lennard-Jones kinds, from the coefficients of the potential."""
-    size = len(kinds)
-    sigma, epsilon = np.ones((size, size)), np.zeros((size, size))
-    if law is None:
-        return sigma, epsilon
-    for i, one in enumerate(kinds):
-        for j, other in enumerate(kinds):
-            if one < 0 or other < 0 or law.c6[one, other] == 0:
-                continue
-            c12, c6 = law.c12[one, other], law.c6[one, other]
-            sigma[i, j], epsilon[i, j] = (c12 / c6) ** (1 / 6), c6**2 / (4 * c12)
-    return sigma, epsilon
 
 
 # Pair potentials as formulas and tables of r, for engines that lack the potential with its truncation. Formulas are in

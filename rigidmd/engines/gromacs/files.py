@@ -161,8 +161,7 @@ def _settings(view: ForceFieldView, k: int) -> str:
     def every(interval: float) -> int:
         return max(1, round(interval * 1e3 / stage.timestep_fs))
 
-    keeps = system.freedom_in(k).translation < 3 * len(system.model.species)
-    interval = system.removes_momentum_every
+    keeps, interval = system.freedom_in(k).translation < 3 * len(system.model.species), system.removes_momentum_every
     integrator, _ = TRANSLATIONS.of("thermostat")[stage.thermostat]
     found: dict[str, object] = {
         "integrator": integrator, "dt": f"{stage.timestep_fs * 1e-3:.12g}", "nsteps": stage.steps,
