@@ -12,7 +12,6 @@ from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
-from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -65,15 +64,10 @@ def _describe_body(system: BodySystem) -> str:
         spin = float(np.linalg.norm(pose.angular_velocity_body))
         period = f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
         lines.append(f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}")
-    body = system.body
-    if isinstance(system.method, Scheme):
-        model = system.engine().model_for(system.method)
-        body = model if isinstance(model, Body) else body
-    parts = [body.translation, body.rotor, body.frame, body.resistance]
-    lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in parts if part)}")
+    body = system.engine().model_for(system.method) if isinstance(system.method, Scheme) else system.body
+    lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in body if part)}")
     lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
-    lines.append("left out:")
-    lines += [f"  {reason}" for reason in system.left_out]
+    lines += ["left out:", *(f"  {reason}" for reason in system.left_out)]
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
     every = max(1, round(not_none(scene.output.interval_s) / run.timestep_s))
@@ -94,15 +88,13 @@ def _describe_molecules(system: System) -> str:
     lines.append(
         f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
     )
+    box = "no box"
     if system.space.volume < inf:
         cell = cell_of(system.space)
         edges = " x ".join(f"{edge:.4f}" for edge in np.linalg.norm(cell, axis=1))
         angles = "" if right_angled(cell) else f", angles {', '.join(f'{x:.4g}' for x in edges_and_angles(cell)[3:])}°"
-        lines.append(f"  box: {edges} Å{angles}, {system.density:.4f} g/cm³")
-    else:
-        lines.append("  no box")
-    lines += [f"  {note}" for note in system.notes]
-    lines.append("\ncompiled in:")
+        box = f"box: {edges} Å{angles}, {system.density:.4f} g/cm³"
+    lines += [f"  {box}", *(f"  {note}" for note in system.notes), "\ncompiled in:"]
     fields = scene.fields.entries
     for name, term in system.terms.items():
         of_field = fields[name][0].sentence(fields[name][1], term) if name in fields else ""
@@ -123,9 +115,7 @@ def _describe_molecules(system: System) -> str:
         lines.append(f"  total momentum: removed{part} every {interval:g} ps")
     if (system.external or system.user_terms) and len(kept) < 3:
         lines.append(f"  total momentum: conserved {'along ' + ' and '.join(kept) if kept else 'nowhere'}")
-    lines.append("left out:")
-    lines += [f"  {reason}" for reason in system.left_out]
-    lines.append("\nstages:")
+    lines += ["left out:", *(f"  {reason}" for reason in system.left_out), "\nstages:"]
     for k, stage in enumerate(scene.stages):
         steps, sampled = describe_stage(stage)
         lines += [f"  {k}: {steps}", f"     {sampled}"]

@@ -61,9 +61,15 @@ def scene_from_atoms(
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
     data = plain_values(settings)
-    faults = [f"{key} is given by the atoms and models" for key in ("molecules",) if key in data]
-    structure, start, box = (data.setdefault(key, {}) for key in ("structure", "start", "box"))
-    if faults := faults + _table_errors(data):
+    filled = {key: data.setdefault(key, {}) for key in ("structure", "start", "box")}
+    faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
+    for key, table in filled.items():
+        if not isinstance(table, Mapping):
+            kind = type(table).__name__
+            faults.append(f"{key} is a {kind}, must be a dictionary like the table [{key}] of a scene file")
+    structure, start, box = filled.values()
+    given = [key for key in ("file", "frame", "topology") if isinstance(structure, Mapping) and key in structure]
+    if faults := faults + [f"structure.{key} is given by the atoms" for key in given]:
         raise SceneError(SOURCE, faults)
     has_momenta = atoms.has("momenta")
     draws = start.get("temperature_K") is not None
@@ -76,7 +82,14 @@ def scene_from_atoms(
         data["stages"] = [{"duration_ps": DURATION} if moves else {"ensemble": "minimise"}]
     data["molecules"] = _entries(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
-    _warn_of_constraints(atoms)
+    ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
+    if ignored:
+        warnings.warn(
+            f"the constraints of the atoms are ignored ({', '.join(ignored)}): freeze molecules by the models, "
+            'models=[{"model": "spce", "frozen": [1, 2]}]',
+            RigidMDWarning,
+            stacklevel=3,
+        )
     return MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
 
 
@@ -137,16 +150,6 @@ def _digits(values: np.ndarray) -> list[list[str]]:
     return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
 
 
-def _table_errors(data: Mapping[str, Any]) -> list[str]:
-    """Messages on tables that the atoms fill in."""
-    wrong = {key: type(data[key]) for key in ("structure", "start", "box") if not isinstance(data[key], Mapping)}
-    if wrong:
-        must = "must be a dictionary like the table"
-        return [f"{key} is a {kind.__name__}, {must} [{key}] of a scene file" for key, kind in wrong.items()]
-    given = [key for key in ("file", "frame", "topology") if key in data["structure"]]
-    return [f"structure.{key} is given by the atoms" for key in given]
-
-
 def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the working directory."""
     found = []
@@ -160,15 +163,3 @@ def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, 
         else:
             found.append({"model": entry})
     return found
-
-
-def _warn_of_constraints(atoms: "ase.Atoms") -> None:
-    """Warn of constraints on more than the shape of molecules."""
-    ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
-    if ignored:
-        warnings.warn(
-            f"the constraints of the atoms are ignored ({', '.join(ignored)}): freeze molecules by the models, "
-            'models=[{"model": "spce", "frozen": [1, 2]}]',
-            RigidMDWarning,
-            stacklevel=4,
-        )

@@ -172,12 +172,9 @@ class Molecule:
     @property
     def planar(self) -> bool:
         """Whether all sites, massless ones included, lie in one plane but not on one line."""
-        return bool(self._extents[2] <= OFF_AXIS * self.radius < self._extents[1])
-
-    @property
-    def _extents(self) -> np.ndarray:
-        """Extents (3,) of the sites along the principal axes of their shape, Å, descending."""
-        return np.append(np.linalg.svd(self.positions_body, compute_uv=False), [0.0, 0.0])[:3]
+        # extents along the principal axes of the shape, descending; fewer than three for one or two sites
+        extents = [*np.linalg.svd(self.positions_body, compute_uv=False), 0.0, 0.0]
+        return bool(extents[2] <= OFF_AXIS * self.radius < extents[1])
 
     @property
     def description(self) -> str:
@@ -199,12 +196,9 @@ class Molecule:
         entries = []
         for i, name in enumerate(self.site_names):
             entry = {
-                "name": name,
-                "element": self.elements[i],
-                "mass_u": float(self.masses[i]),
-                "position_A": [float(x) for x in self.positions_body[i]],
-                "charge_e": float(self.charges[i]),
-            }
+                "name": name, "element": self.elements[i], "mass_u": float(self.masses[i]),
+                "position_A": self.positions_body[i].tolist(), "charge_e": float(self.charges[i]),
+            }  # fmt: skip
             if self.epsilon[i] > 0:
                 entry |= {"sigma_A": float(self.sigma[i]), "epsilon_kJ_mol": float(self.epsilon[i] / KJ_PER_MOL)}
             if self.parameters[i]:
@@ -223,8 +217,7 @@ def molecule(
         faults.append(f"has {len(sites)} sites, must not have more than {MOST_SITES}")
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
-    masses = np.array([s.mass_u for s in sites])
-    positions = np.array([s.position_A for s in sites])
+    masses, positions = np.array([s.mass_u for s in sites]), np.array([s.position_A for s in sites])
     if masses.sum() == 0:
         raise MoleculeError(f"molecule {name}", ["all sites are massless; a body needs mass to move"])
     size = float(np.linalg.norm(positions - masses @ positions / masses.sum(), axis=1).max())
@@ -235,12 +228,10 @@ def molecule(
     near = KDTree(body).query_pairs(COINCIDENT * size, output_type="ndarray")
     faults += [f"sites {sites[j].name} and {sites[i].name} coincide" for i, j in sorted(near[:, ::-1].tolist())]
     if frame.kind == "linear" or (frame.kind == "point" and not faults):
-        off = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1)
-        where = {
-            "linear": "off the axis of a linear body: nothing resists its torque about that axis",
-            "point": "from the centre of mass, but all the mass is there: nothing resists its torque",
-        }[frame.kind]
-        limit = OFF_AXIS * size
+        off, limit = np.linalg.norm(body[:, 1:] if frame.kind == "linear" else body, axis=1), OFF_AXIS * size
+        where = "from the centre of mass, but all the mass is there: nothing resists its torque"
+        if frame.kind == "linear":
+            where = "off the axis of a linear body: nothing resists its torque about that axis"
         faults += [f"site {s.name} is {d:.3g} Å {where}" for s, d in zip(sites, off, strict=True) if d > limit]
     if faults:
         raise MoleculeError(f"molecule {name}", faults)
@@ -259,9 +250,8 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
     """The same molecule with other masses (u) of isotopes, by site name or else element. Raises MoleculeError."""
     faults, changed = [], {}
     for key, mass in masses.items():
-        sites = [i for i, name in enumerate(found.site_names) if name == key] or [
-            i for i, element in enumerate(found.elements) if element == key
-        ]
+        sites = [i for i, name in enumerate(found.site_names) if name == key]
+        sites = sites or [i for i, element in enumerate(found.elements) if element == key]
         heavy = [i for i in sites if found.masses[i] > 0]
         if not heavy:
             known = ", ".join(dict.fromkeys([*found.elements, *found.site_names]))
@@ -294,14 +284,10 @@ def find_site(sites: tuple[Site, ...], name: str, element: str) -> Site | None:
     return next((s for s in sites if s.name == name), None) or next((s for s in sites if s.name == element), None)
 
 
+@cache
 def available_models() -> list[str]:
     """Names of the shipped models."""
-    return list(_shipped())
-
-
-@cache
-def _shipped() -> tuple[str, ...]:
-    return tuple(sorted(path.stem for path in MODELS.glob("*.toml")))
+    return sorted(path.stem for path in MODELS.glob("*.toml"))
 
 
 @cache
@@ -330,10 +316,9 @@ def read_molecule(path: Path) -> Molecule:
 def read_parameters(path: Path) -> ParameterFile:
     """A table of parameters. Raises MoleculeError."""
     table = _read(path, ParameterFile)
-    entries = table.sites
-    names = [s.name for s in entries]
+    names = [s.name for s in table.sites]
     faults = [f"sites: {name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
-    faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in entries if s.position_A is not None]
+    faults += [f"sites: {s.name}: position_A belongs to a molecule" for s in table.sites if s.position_A is not None]
     if faults:
         raise MoleculeError(str(path), faults)
     return table

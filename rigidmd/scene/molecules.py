@@ -1,7 +1,7 @@
 """The scene of molecules: species, box, forces, stages, output."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
@@ -237,20 +237,15 @@ class MolecularScene(Scene):
 
     @property
     def inputs(self) -> dict[str, Path]:
-        found = {}
+        found: dict[str, str | None] = {}
         if self.structure is not None and "structure.file" not in self.embedded_files:
-            found["structure.file"] = self.path(self.structure.file)
-        if (names := self.topology) is not None:
-            found["structure.topology"] = self.path(names)
+            found["structure.file"] = self.structure.file
+        found["structure.topology"] = self.topology
         for k, species in enumerate(self.molecules):
-            for key in SPECIES_FILES:
-                if (name := getattr(species, key)) is not None:
-                    found[f"molecules.{k}.{key}"] = self.path(name)
+            found |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
         for k, force in enumerate(self.forces.custom):
-            for key in FORCE_FILES:
-                if (name := getattr(force, key)) is not None:
-                    found[f"forces.custom.{k}.{key}"] = self.path(name)
-        return found
+            found |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
+        return {key: self.path(name) for key, name in found.items() if name is not None}
 
     @property
     def structure_source(self) -> str:
@@ -262,10 +257,10 @@ class MolecularScene(Scene):
     @property
     def topology(self) -> str | None:
         """The topology file of a trajectory as structure: as given, or else as found in the trajectory's folder."""
-        start = self.structure
-        form = None if start is None else format_of(start.file)
-        if start is None or start.topology is not None or form is None or form.read_arrays is None:
-            return None if start is None else start.topology
+        if (start := self.structure) is None:
+            return None
+        if start.topology is not None or (form := format_of(start.file)) is None or form.read_arrays is None:
+            return start.topology
         candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
         return next((name for name in candidates if self.path(name).is_file()), None)
 
@@ -279,13 +274,11 @@ class MolecularScene(Scene):
             yield "box.density_g_cm3 and a structure file contradict each other: omit one"
         elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
             yield "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
-        first = self.first_moving
-        if self.start.temperature_K is None and first is not None and first.temperature_K is None:
-            from_file = self.structure is not None and self.structure.velocities
-            if not from_file:
-                which = "the first stage" if first is self.stages[0] else "the first stage in which time passes"
-                yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
-        if self.start.temperature_K is not None and self.structure is not None and self.structure.velocities:
+        first, from_file = self.first_moving, self.structure is not None and self.structure.velocities
+        if self.start.temperature_K is None and first is not None and first.temperature_K is None and not from_file:
+            which = "the first stage" if first is self.stages[0] else "the first stage in which time passes"
+            yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
+        if self.start.temperature_K is not None and from_file:
             yield "start.temperature_K would do nothing: the velocities are read from the structure file"
         rescaled = first is not None and first.has_thermostat and first.keeps_momentum
         if self.start.temperature_K == 0 and rescaled:
@@ -332,27 +325,24 @@ class MolecularScene(Scene):
             for (key, wanted, step, taken), where in found.items()
         ]
 
-    def _uneven_frames(self) -> list[str]:
+    def _uneven_frames(self) -> Iterator[str]:
         """Messages on stages with other intervals between frames, for a file with one interval for all frames."""
         kind = Path(self.output.trajectory or "").suffix
         if not kind or not BY_EXTENSION[kind].even:
-            return []
+            return
         wanted, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
-        faults = []
         for k, stage in enumerate(self.stages):
-            if stage.is_minimisation:
-                continue
-            if stage.is_auto:
-                faults.append(f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}")
-                continue
             every = max(1, round(wanted * 1000 / stage.timestep_fs))
             uneven = stage.steps % every and k < len(self.stages) - 1
-            if abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
-                faults.append(
+            if stage.is_auto and not stage.is_minimisation:
+                yield f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}"
+            elif not stage.is_minimisation and (
+                abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven
+            ):
+                yield (
                     f"output.trajectory: a {kind} file stores one time between frames, and stages.{k} cannot keep "
                     f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
                 )
-        return faults
 
     @classmethod
     def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
@@ -366,12 +356,12 @@ class MolecularScene(Scene):
             tables += [
                 (f"{name}.{k}", entry, keys) for k, entry in enumerate(entries if isinstance(entries, list) else ())
             ]
-        named = [
-            (f"{name}.{key}", table.get(key)) for name, table, keys in tables if isinstance(table, dict) for key in keys
-        ]
+        named = {
+            f"{name}.{key}": table.get(key) for name, table, keys in tables if isinstance(table, dict) for key in keys
+        }
         return [
             f"{key}: {shorten_repr(file)} is outside the scene's folder; move it there, or set it by --set {key}=PATH"
-            for key, file in named
+            for key, file in named.items()
             if isinstance(file, str) and not _is_inside(folder / file, folder)
         ]
 

@@ -183,10 +183,10 @@ class _SiteTypes:
         known = dict.fromkeys(name for m in species for site in m.site_names for name in (site, f"{m.name}.{site}"))
         known |= dict.fromkeys(e for m in species for e in m.elements)
         listed = [*(potential.of_sites or {}), *potential.sites, *(name for pair in potential.pairs for name in pair)]
-        there = f"; there are {', '.join(known)}"
         self._named = {name: sites_named(species, name) for name in listed}
         unknown = [name for name, sites in self._named.items() if not any(mask.any() for mask in sites)]
-        faults = [f"no site is {name!r}{did_you_mean(name, list(known)) or there}" for name in unknown]
+        there = f"; there are {', '.join(known)}"
+        faults = [f"no site is {name!r}{did_you_mean(name, known) or there}" for name in unknown]
         self._needed = [name for name in formula.parameters if name not in potential.constants and not formula.shared]
         of_pairs = [("-".join(pair), given) for pair, given in potential.pairs.items()]
         for where, given in [*(potential.of_sites or {}).items(), *of_pairs]:
@@ -231,13 +231,11 @@ class _SiteTypes:
         potential = self._potential
         if potential.sites and not any(self._named[name][k][i] for name in potential.sites):
             return None
-        if potential.of_sites is None:
-            if self._formula.shared:
-                return {"scale": 1.0} if not potential.pairs else None
+        if potential.of_sites is None and not self._formula.shared:
             given = m.parameters[i]
             return {name: given[name] for name in self._needed} if all(name in given for name in self._needed) else None
         if not potential.of_sites:
-            return {} if not potential.pairs else None
+            return None if potential.pairs else {"scale": 1.0} if potential.of_sites is None else {}
         named = [name for name in potential.of_sites if self._named[name][k][i]]
         ranked = (f"{m.name}.{m.site_names[i]}", f"{m.name}.{m.elements[i]}", m.site_names[i], m.elements[i])
         return next((potential.of_sites[name] for name in ranked if name in named), None)
@@ -322,35 +320,29 @@ def pair_law(
     for parameter, rule in (mixing or {}).items():
         if rule not in RULES:
             raise ValueError(f"mixing of {parameter} is {rule!r}; there are {', '.join(RULES)}")
-    kind, constants, of_sites = None, {}, None
+    given = [*([] if parameters is None else [parameters]), *(pairs or {}).values()]
+    constants, of_sites, of_pairs = {}, {} if pairs else None, {}
     if parameters is not None:
-        kind = type(parameters) if hasattr(parameters, "_asdict") else None
         parameters = _mapping("parameters", parameters)
+        given[1:1] = parameters.values()
         flat = [key for key, value in parameters.items() if isinstance(value, int | float | np.number)]
         if flat and len(flat) < len(parameters):
             others = ", ".join(str(key) for key in parameters if key not in flat)
             either = "parameters are either numbers, the same for all sites, or tables of numbers by site"
             raise ValueError(f"{either}; {flat[0]} is a number, and {others} is not")
-        if flat:
-            constants, of_sites = _numbers("parameters", parameters), {}
-        else:
-            of_sites = {}
-            for key, value in parameters.items():
-                kind = type(value) if hasattr(value, "_asdict") else kind
-                of_sites[key] = _numbers(f"parameters of {key}", value)
-    elif pairs:
-        of_sites = {}
-    of_pairs = {}
+        constants = _numbers("parameters", parameters) if flat else {}
+        of_sites = {} if flat else {key: _numbers(f"parameters of {key}", x) for key, x in parameters.items()}
     for key, value in (pairs or {}).items():
         if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(one, str) for one in key)):
             raise ValueError(f"pairs: {key!r} is not a pair of names of sites")
-        kind = type(value) if hasattr(value, "_asdict") else kind
         of_pairs[key] = _numbers(f"parameters of {'-'.join(key)}", value)
     for key, value in (("cutoff_A", cutoff_A), ("switch_start_A", switch_start_A)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
-    formula = formula_of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
+    kinds = [type(value) for value in given if hasattr(value, "_asdict")]  # a NamedTuple that a function expects
+    is_function = energy is not None and not isinstance(energy, str)
+    formula = formula_of_function(energy, kinds[-1] if kinds else None) if is_function else None
     return PairLaw(
         energy, columns, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
         switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
