@@ -332,13 +332,13 @@ class MolecularScene(Scene):
             return
         wanted, other = self.output.trajectory_interval_ps, f"use {Path(TRAJECTORY).suffix}"
         for k, stage in enumerate(self.stages):
+            if stage.is_minimisation:
+                continue
             every = max(1, round(wanted * 1000 / stage.timestep_fs))
             uneven = stage.steps % every and k < len(self.stages) - 1
-            if stage.is_auto and not stage.is_minimisation:
+            if stage.is_auto:
                 yield f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}"
-            elif not stage.is_minimisation and (
-                abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven
-            ):
+            elif abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
                 yield (
                     f"output.trajectory: a {kind} file stores one time between frames, and stages.{k} cannot keep "
                     f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
@@ -348,17 +348,13 @@ class MolecularScene(Scene):
     def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
         forces = data.get("forces")
         custom = forces.get("custom") if isinstance(forces, dict) else None
-        tables = [("structure", data.get("structure"), ("file", "topology"))]
-        for name, entries, keys in (
-            ("molecules", data.get("molecules"), SPECIES_FILES),
-            ("forces.custom", custom, FORCE_FILES),
-        ):
-            tables += [
-                (f"{name}.{k}", entry, keys) for k, entry in enumerate(entries if isinstance(entries, list) else ())
-            ]
-        named = {
-            f"{name}.{key}": table.get(key) for name, table, keys in tables if isinstance(table, dict) for key in keys
-        }
+        tables = {"structure": (data.get("structure"), ("file", "topology"))}
+        lists = {"molecules": (data.get("molecules"), SPECIES_FILES), "forces.custom": (custom, FORCE_FILES)}
+        for name, (entries, keys) in lists.items():
+            for k, entry in enumerate(entries if isinstance(entries, list) else ()):
+                tables[f"{name}.{k}"] = entry, keys
+        given = [(name, table, key) for name, (table, keys) in tables.items() for key in keys]
+        named = {f"{name}.{key}": table.get(key) for name, table, key in given if isinstance(table, dict)}
         return [
             f"{key}: {shorten_repr(file)} is outside the scene's folder; move it there, or set it by --set {key}=PATH"
             for key, file in named.items()
