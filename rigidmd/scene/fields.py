@@ -1,6 +1,6 @@
 """The table [fields] of a scene of molecules: electric field, gravity, walls, restraints."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -193,43 +193,35 @@ FIELDS = {
 
 def field_notes(scene: "MolecularScene") -> list[str]:
     method = scene.forces.electrostatics
-    if not scene.fields.walls or not ELECTROSTATICS[method].sums_images:
-        return []
-    return [
+    note = (
         f"fields.walls: {method} includes the periodic images beyond the walls, which act on the layer between the "
         "walls across the empty part of the box; a longer box reduces this effect"
-    ]
+    )
+    return [note] if scene.fields.walls and ELECTROSTATICS[method].sums_images else []
 
 
-def field_errors(scene: "MolecularScene") -> list[str]:
+def field_errors(scene: "MolecularScene") -> Iterator[str]:
     """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
     held = bool(fields.restraints) or any(species.frozen for species in scene.molecules)
-    faults = []
     for k, walls in enumerate(fields.walls):
         if boxed and inf in map(abs, walls.positions_A):
-            faults.append(
-                f"fields.walls.{k}.positions_A: a periodic box needs both walls, or molecules would cross the periodic "
-                "boundary to the other side"
-            )
+            why = "or molecules would cross the periodic boundary to the other side"
+            yield f"fields.walls.{k}.positions_A: a periodic box needs both walls, {why}"
     for axis, name in enumerate(AXES):
         bounds = fields.bounds(axis)
         if bounds is not None and not bounds[0] < bounds[1]:
-            faults.append(f"fields.walls: the walls across {name} leave no space between them")
+            yield f"fields.walls: the walls across {name} leave no space between them"
         along = fields.gravity_m_s2 is not None and fields.gravity_m_s2[axis]
         if along and boxed and bounds is None and not held:
-            faults.append(
+            yield (
                 f"fields.gravity_m_s2: nothing stops the fall along {name}, which is periodic: all molecules would be "
                 f"accelerated together. Add walls across {name}, freeze or restrain some molecules, or use no box"
             )
     if fields.walls and scene.forces.tail_correction:
-        faults.append("forces.tail_correction assumes a uniform liquid: omit it between walls")
-    if fields.electric_frequency_per_ps is not None:
-        period = 1000 / fields.electric_frequency_per_ps
-        faults += [
-            f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is less than two steps of stages.{k} "
-            f"({stage.timestep_fs:g} fs), which cannot follow it"
-            for k, stage in enumerate(scene.stages)
-            if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs
-        ]
-    return faults
+        yield "forces.tail_correction assumes a uniform liquid: omit it between walls"
+    period = inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps
+    for k, stage in enumerate(scene.stages):
+        if not (stage.is_auto or stage.is_minimisation) and period < 2 * stage.timestep_fs:
+            what = f"less than two steps of stages.{k} ({stage.timestep_fs:g} fs), which cannot follow it"
+            yield f"fields.electric_frequency_per_ps: a period of {period:.3g} fs is {what}"

@@ -286,8 +286,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     def pressures(self) -> tuple[Six, Six]:
         """Pressure at begin and end, bar: xx, yy, zz, xy, xz, yz."""
         given = self.pressure_bar
-        ends = given if isinstance(given, tuple) and len(given) == 2 else (given, given)
-        return _tensor(ends[0]), _tensor(ends[1])
+        first, last = given if isinstance(given, tuple) and len(given) == 2 else (given, given)
+        return _tensor(first), _tensor(last)
 
     @property
     def ramps(self) -> bool:

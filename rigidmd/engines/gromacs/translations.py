@@ -5,7 +5,6 @@ from math import inf
 import numpy as np
 
 from rigidmd.engines.external import SPLIT, Key, Limit, Missing, Translations, moves
-from rigidmd.engines.force_field import ForceFieldView
 from rigidmd.engines.rigid_bodies import SAME, MassPoints, mass_points
 from rigidmd.scene.models import Molecule
 
@@ -19,10 +18,6 @@ def gromacs_points(molecule: Molecule) -> MassPoints:
     d = {(i, j): distance for i, j, distance in body.distances}
     fits = d[0, 1] == d[0, 2] and abs(body.mass[1] - body.mass[2]) <= SAME * body.mass[1]
     return body if fits and (np.diff(body.site) == 1).all() else mass_points(molecule, sites=False)
-
-
-def _solids(view: ForceFieldView) -> str:
-    return ", ".join(m.name for m in view.system.species if len(gromacs_points(m).mass) > 3)
 
 
 _INTEGRATOR, *_LIMITS = moves("GROMACS", "molecules")
@@ -58,7 +53,8 @@ TRANSLATIONS = Translations(
             and view.truncation,
         ),
         Limit("frozen molecules: GROMACS would compute forces between them", lambda view: view.frozen.any()),
-        Limit("{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane", _solids),
+        Limit("{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane",
+            lambda view: ", ".join(m.name for m in view.system.species if len(gromacs_points(m).mass) > 3)),
         Limit("several kinds of planar molecules: GROMACS' SETTLE has one kind of triangle",
             lambda view: sum(len(gromacs_points(m).mass) == 3 for m in view.system.species) > 1),
     ),

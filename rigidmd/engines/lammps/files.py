@@ -1,6 +1,6 @@
 """Input files of LAMMPS (units real) for a system: atoms, settings, and the stages of a run."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from math import inf, pi
 from pathlib import Path
 from types import MappingProxyType
@@ -51,15 +51,14 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     image = np.zeros(position.shape, int)
     lines = [f"{system.scene.name}, written by rigidmd", ""]
     lines += [f"{len(position)} atoms", f"{len(view.kinds)} atom types", ""]
+    low, high, tilt = position.min(axis=0) - 1, position.max(axis=0) + 1, ()
     if view.is_periodic:
         image = np.floor(position @ np.linalg.inv(state.cell)).astype(int)
         position = position - image @ state.cell
         low, high = np.zeros(3), state.cell.diagonal()
-        lines += _bounds(low, high)
         tilt = (state.cell[1, 0], state.cell[2, 0], state.cell[2, 1])
-        lines += [f"{' '.join(map(_num, tilt))} xy xz yz"] if any(tilt) else []
-    else:
-        lines += _bounds(position.min(axis=0) - 1, position.max(axis=0) + 1)
+    lines += [f"{_num(a)} {_num(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
+    lines += [f"{' '.join(map(_num, tilt))} xy xz yz"] if any(tilt) else []
     lines += ["", "Masses", ""]
     lines += [f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
     lines += ["", "Atoms # full", ""]
@@ -78,10 +77,6 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
 def _num(number: Any) -> str:
     """The shortest decimal form of a number that is read back exactly."""
     return repr(float(number))
-
-
-def _bounds(low: np.ndarray, high: np.ndarray) -> list[str]:
-    return [f"{_num(a)} {_num(b)} {axis}lo {axis}hi" for a, b, axis in zip(low, high, "xyz", strict=True)]
 
 
 def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
@@ -112,21 +107,13 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
     points = ~view.is_body & ~view.frozen
     for name, members in ((BODIES, view.is_body), (POINTS, points), (FROZEN, view.frozen)):
         if members.any():
-            lines += [f"group {name} molecule {_ranges(np.flatnonzero(members) + 1)}"]
+            numbers = np.flatnonzero(members) + 1
+            runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)  # as 1:5 7 9:12
+            ranges = " ".join(f"{run[0]}:{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+            lines += [f"group {name} molecule {ranges}"]
     if view.frozen.any():
         lines += [f"neigh_modify exclude group {FROZEN} {FROZEN}"]
     return lines
-
-
-def _ranges(numbers: Iterable[int]) -> str:
-    """Numbers as 1:5 7 9:12."""
-    found: list[list[int]] = []
-    for number in numbers:
-        if found and number == found[-1][1] + 1:
-            found[-1][1] = int(number)
-        else:
-            found.append([int(number), int(number)])
-    return " ".join(str(a) if a == b else f"{a}:{b}" for a, b in found)
 
 
 def _cutoff(cutoff: float) -> float:
