@@ -152,6 +152,18 @@ class MassPoints(NamedTuple):
     virtual_sites: dict[int, VirtualSite]  # all sites that are not at mass points
 
     @property
+    def extra(self) -> int:
+        """Number of points without a site."""
+        return int((self.site < 0).sum())
+
+    def particles(self, sites: int) -> tuple[np.ndarray, np.ndarray]:
+        """The particle of each point (p,), and the masses of all particles: `sites` sites, then the other points."""
+        at = np.where(self.site < 0, sites + np.cumsum(self.site < 0) - 1, self.site)
+        mass = np.zeros(sites + self.extra)
+        mass[at] = self.mass
+        return at, mass
+
+    @property
     def distances(self) -> list[tuple[int, int, float]]:
         """All pairs of points and their distances, Å."""
         found: list[tuple[int, int, float]] = []

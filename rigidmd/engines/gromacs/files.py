@@ -56,18 +56,13 @@ def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]
     return list(text)
 
 
-def _extra_points(molecule: Molecule, body: MassPoints) -> int:
-    """Number of mass points of a molecule without a site. They come after its sites."""
-    return int((body.site < 0).sum())
-
-
 def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -> str:
     """The .gro file, with velocities."""
     system = view.system
     species = system.model.species
     at, velocity = system.site_positions(state), system.site_velocities(state)
     extra = Points(
-        np.repeat(np.arange(len(species)), [_extra_points(system.species[k], bodies[k]) for k in species]),
+        np.repeat(np.arange(len(species)), [bodies[k].extra for k in species]),
         gather_per_molecule([body.position_body[body.site < 0] for body in bodies], species),
         gather_per_molecule([body.mass[body.site < 0] for body in bodies], species),
     )
@@ -75,8 +70,8 @@ def _coordinates(view: ForceFieldView, bodies: list[MassPoints], state: State) -
     width = DECIMALS + 5
     rows, s, e = [], 0, 0
     for n, k in enumerate(species):
-        m = system.species[k]
-        count, added = len(m.masses), _extra_points(m, bodies[k])
+        m, added = system.species[k], bodies[k].extra
+        count = len(m.masses)
         names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(added))]
         positions = np.concatenate([at[s : s + count], more[e : e + added]])
         velocities = np.concatenate([velocity[s : s + count], more_velocity[e : e + added]])
@@ -102,7 +97,7 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     for k, kind in enumerate(kinds):
         parameters = f"{kind.mass:.10g} 0 A {sigma[k, k]:.12g} {epsilon[k, k]:.12g}"
         lines.append(f"K{k + 1} {parameters} ; {in_comment(kind.name)}")
-    if any(_extra_points(m, body) for m, body in zip(system.species, bodies, strict=True)):
+    if any(body.extra for body in bodies):
         lines += [f"{POINT} 0 0 A 0 0 ; a point with mass alone"]
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
     pairs = [(i, j) for i in range(len(kinds)) for j in range(i, len(kinds))]
@@ -121,19 +116,15 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
 
 
 def _molecule(view: ForceFieldView, m: Molecule, body: MassPoints, kind: np.ndarray, name: str) -> list[str]:
-    count, charges = len(m.masses), m.charges if view.coulomb is not None else np.zeros(len(m.masses))
-    extra = np.cumsum(body.site < 0) - 1
-    where = np.where(body.site >= 0, body.site, count + extra)
-    mass = np.zeros(count + _extra_points(m, body))
-    mass[where] = body.mass
-    types = [*(f"K{k + 1}" for k in kind), *[POINT] * _extra_points(m, body)]
-    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(_extra_points(m, body)))]
+    where, mass = body.particles(len(m.masses))
+    charges = np.zeros(len(mass))
+    charges[: len(m.charges)] = m.charges if view.coulomb is not None else 0.0
+    types = [*(f"K{k + 1}" for k in kind), *[POINT] * body.extra]
+    names = [*map(as_word, m.site_names), *(f"P{j + 1}" for j in range(body.extra))]
     lines = ["[ moleculetype ]", "; name nrexcl", f"{name} 1", "", "[ atoms ]"]
     residue = as_word(m.residue_names[0])
-    lines += [
-        f"{i + 1} {types[i]} 1 {residue} {names[i]} 1 {charges[i] if i < count else 0.0:.12g} {mass[i]:.12g}"
-        for i in range(len(mass))
-    ]
+    for i, (kind_name, atom, charge, of_atom) in enumerate(zip(types, names, charges, mass, strict=True), 1):
+        lines.append(f"{i} {kind_name} 1 {residue} {atom} 1 {charge:.12g} {of_atom:.12g}")
     at = [int(p) + 1 for p in where]
     if len(at) == 3:
         d = {(i, j): distance * NM for i, j, distance in body.distances}

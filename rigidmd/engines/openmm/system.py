@@ -88,10 +88,9 @@ def layout(view: ForceFieldView) -> Layout:
     bodies = [mass_points(m, bool(is_frozen)) for m, is_frozen in zip(system.species, frozen, strict=True)]
     local, mass = [], []
     for m, body, is_frozen in zip(system.species, bodies, frozen, strict=True):
-        extra = np.cumsum(body.site < 0) - 1
-        local.append(np.where(body.site >= 0, body.site, len(m.masses) + extra))
-        mass.append(np.zeros(len(m.masses) + int((body.site < 0).sum())))
-        mass[-1][local[-1]] = 0.0 if is_frozen else body.mass
+        at, of_particles = body.particles(len(m.masses))
+        local.append(at)
+        mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
     count = np.array([len(of_species) for of_species in mass])[species]
     first = np.cumsum(count) - count
     sites = system.sites_per_molecule
