@@ -341,8 +341,8 @@ def pair_law(
             raise ValueError(f"{key} is {value!r}, must be a number above 0")
     usual = "table" if table is not None else getattr(energy, "__name__", "pair_law")
     kinds = [type(value) for value in given if hasattr(value, "_asdict")]  # a NamedTuple that a function expects
-    is_function = energy is not None and not isinstance(energy, str)
-    formula = formula_of_function(energy, kinds[-1] if kinds else None) if is_function else None
+    kind = kinds[-1] if kinds else None
+    formula = formula_of_function(energy, kind) if energy is not None and not isinstance(energy, str) else None
     return PairLaw(
         energy, columns, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
         switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
