@@ -1,6 +1,5 @@
 """The system of a scene of molecules: species, model, start, terms. All errors are collected and raised together."""
 
-from dataclasses import replace
 from importlib import import_module
 from math import inf
 from typing import NamedTuple
@@ -71,6 +70,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         if scene.from_python != scene.user_code.names:
             raise SceneError(scene.source, [missing_user_code(scene.from_python, scene.user_code.names)])
         if scene.forces.custom or scene.from_python:
+            from rigidmd.assemble.user_code.binding import with_user_code
+
             system = with_user_code(system)
             scene, model = system.scene, system.model
     if names := ", ".join(name.replace("_", " ") for name in system.position_dependent):
@@ -105,22 +106,6 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     else:
         system.notes.extend(f"box: {note}" for note in start.notes)
     return system
-
-
-def with_user_code(system: System) -> System:
-    """The system with the terms and the thermostat of users. Raises SceneError with all errors."""
-    from rigidmd.assemble.user_code.binding import user_terms
-
-    added = user_terms(system)
-    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~added.changes_momentum)
-    # Forces computed by Python come first: as long as they are missing, no other need be computed.
-    terms = {name: added.terms[name] for name in added.python_forces} | system.terms | added.terms
-    return replace(
-        system, scene=with_momentum_removal(system.scene, model.keeps_momentum), terms=terms, model=model,
-        freedom=count_degrees_of_freedom(model), python_forces=added.python_forces, thermostat=added.thermostat,
-        tail=sum_of_tails([*([system.tail] if system.tail is not None else []), *added.tails]),
-        user_terms=added.descriptions, notes=[*system.notes, *added.notes],
-    )  # fmt: skip
 
 
 def interactions(parts: SystemParts) -> Interactions:

@@ -1,23 +1,25 @@
 """Binds user code to a system: forces and a thermostat become terms, and errors in their code become messages."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
 from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
-from rigidmd.core.state import State
+from rigidmd.dynamics.momenta import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
-from rigidmd.forces.parts import Tail
+from rigidmd.forces.parts import Tail, sum_of_tails
 from rigidmd.scene.molecules import UserCode, name_of
 from rigidmd.scene.validation import did_you_mean
 
@@ -25,18 +27,6 @@ if TYPE_CHECKING:
     from rigidmd.engines.system import System
     from rigidmd.scene import MolecularScene
     from rigidmd.scene.forces import CustomForce
-
-
-class UserTerms(NamedTuple):
-    """The terms that user code adds to a system."""
-
-    terms: dict[str, NamedTuple]
-    python_forces: dict[str, Callable[[Any, State], None]]  # functions that compute terms in Python
-    changes_momentum: np.ndarray  # (3,) whether they may change components of the total momentum
-    thermostat: Any
-    notes: list[str]
-    descriptions: dict[str, str]  # of the terms
-    tails: list[Tail]  # tail corrections of pair potentials
 
 
 def custom_forces(scene: "MolecularScene") -> list[Any]:
@@ -107,23 +97,24 @@ def user_errors_explained(system: "System") -> Iterator[None]:
         raise SceneError(system.scene.source, [f"{names}: cannot be compiled{where}: {why}"]) from None
 
 
-def user_terms(system: "System") -> UserTerms:
-    """The terms of [[forces.custom]] and of user code from Python. Raises SceneError with all errors."""
-    scene = system.scene
+def with_user_code(system: "System") -> "System":
+    """The system with the terms of [[forces.custom]], and the terms and the thermostat of user code from Python. Raises
+    SceneError with all errors."""
+    scene, thermostat = system.scene, system.scene.user_code.thermostat
     user_code = UserCode((*custom_forces(scene), *scene.user_code.forces))
     names = user_code.force_names([*system.terms, *system.constants])
-    found = UserTerms({}, {}, np.zeros(3, bool), scene.user_code.thermostat, [], {}, [])
-    faults = []
+    found = replace(system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes])
+    terms, tails, faults = {}, [] if system.tail is None else [system.tail], []
+    changed = np.zeros(3, bool)  # whether they may change components of the total momentum
     for name, given in zip(names, user_code.forces, strict=True):
         made = given.made if isinstance(given, _Named) else given
         try:
-            term = _term(made, name, system, found)
+            term = _term(made, name, system, found, tails)
             if not isinstance(term, PairForces):
-                found.changes_momentum[:] |= changes_momentum(term)
-            found.terms[name] = term
+                changed |= changes_momentum(term)
+            terms[name] = term
         except (SceneError, UserForceError, ValueError) as error:
             faults += [f"{name}: {fault}" for fault in getattr(error, "errors", [error])]
-    thermostat = found.thermostat
     if thermostat is not None and not (type(thermostat) in THERMOSTATS or hasattr(thermostat, "for_stage")):
         need = "a NamedTuple of a class with rigidmd.compiled_thermostat nor has a method for_stage(system, k)"
         faults.append(f"thermostat: {thermostat!r:.60} is neither {need}")
@@ -131,25 +122,32 @@ def user_terms(system: "System") -> UserTerms:
         raise SceneError(scene.source, faults)
     if thermostat is not None:
         found.notes.append(f"thermostat: {name_of(thermostat)}, from Python, replaces the thermostats of all stages")
-    return found
+    model = system.model._replace(keeps_momentum=system.model.keeps_momentum & ~changed)
+    # Forces computed by Python come first: as long as they are missing, no other need be computed.
+    terms = {name: terms[name] for name in found.python_forces} | system.terms | terms
+    return replace(
+        found, scene=with_momentum_removal(scene, model.keeps_momentum), terms=terms, model=model,
+        freedom=count_degrees_of_freedom(model), tail=sum_of_tails(tails),
+    )  # fmt: skip
 
 
-def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTuple:
-    """The term of one object. Raises PairPotentialError, ValueError, UserForceError."""
+def _term(made: Any, name: str, system: "System", found: "System", tails: list[Tail]) -> NamedTuple:
+    """The term of one object for a system. Its function, description and notes are added to `found`, its tail
+    correction to `tails`. Raises PairPotentialError, ValueError, UserForceError."""
     if isinstance(made, PairLaw):
         term, formula, tail, notes = made.bind(system)
         if formula.error:
             found.notes.append(f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy")
         found.notes.extend(f"{name}: {note}" for note in notes)
-        found.tails.extend([] if tail is None else [tail])
+        tails += [] if tail is None else [tail]
         cutoff, truncation = made.cutoff_A or system.cutoff, made.truncation or system.scene.forces.truncation
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"
-        found.descriptions[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
+        found.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
         return term
     if isinstance(made, Force):
         bound = BoundForce(made, name, system)
         found.python_forces[name] = bound
-        found.descriptions[name] = f"{type(made).__qualname__}, computed by Python"
+        found.user_terms[name] = f"{type(made).__qualname__}, computed by Python"
         return bound.term
     if hasattr(made, "term"):
         try:
@@ -166,5 +164,5 @@ def _term(made: Any, name: str, system: "System", found: UserTerms) -> NamedTupl
             "rigidmd.compiled_force, or an object whose term(system) makes one"
         )
     numbers = ", ".join(f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float))
-    found.descriptions[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
+    found.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
     return made
