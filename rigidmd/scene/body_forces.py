@@ -1,5 +1,6 @@
 """Tables of a scene that act on a single body: fields, forces, friction, fluids, frames, wheels. SI units."""
 
+from collections.abc import Iterator
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal
@@ -40,27 +41,23 @@ class Timed(Section):
                 raise ValueError(f"must increase: entry {k + 1} is {b:g} after {a:g}")
         return times
 
-    def timing_errors(self, values: dict[str, Any], entry: type) -> list[str]:
+    def timing_errors(self, values: dict[str, Any], entry: type) -> Iterator[str]:
         """Messages on quantities that do not match the times; a single value has the type `entry`."""
-        faults, times = [], self.times_s
+        times = self.times_s
         if times is not None and (self.from_s is not None or self.to_s is not None):
-            faults.append("from_s and to_s would do nothing next to times_s")
+            yield "from_s and to_s would do nothing next to times_s"
         if not (self.to_s is None or self.to_s > (self.from_s or 0)):
-            faults.append(f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}")
+            yield f"to_s = {self.to_s:g} is not after from_s = {self.from_s or 0:g}"
         for key, value in values.items():
-            if value is None:
-                continue
+            many = isinstance(value, tuple) and (entry is float or isinstance(next(iter(value), None), tuple))
             if value == ():
-                faults.append(f"{key} is an empty list")
-                continue
-            many = isinstance(value, tuple) and (entry is float or isinstance(value[0], tuple))
-            if times is None and many:
-                faults.append(f"{key} is a list of values: times_s is missing")
-            elif times is not None and not many:
-                faults.append(f"{key} is one value: with times_s it must be a list of {len(times)}")
-            elif times is not None and len(value) != len(times):
-                faults.append(f"{key} has {len(value)} values for {len(times)} times")
-        return faults
+                yield f"{key} is an empty list"
+            elif times is None and many:
+                yield f"{key} is a list of values: times_s is missing"
+            elif times is not None and value is not None and not many:
+                yield f"{key} is one value: with times_s it must be a list of {len(times)}"
+            elif times is not None and value is not None and len(value) != len(times):
+                yield f"{key} has {len(value)} values for {len(times)} times"
 
     @property
     def window(self) -> tuple[float, float]:
