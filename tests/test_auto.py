@@ -23,7 +23,6 @@ from support import (
     small_scene,
     springs,
     start_of_last_stage,
-    walk,
     weight,
 )
 
@@ -160,7 +159,6 @@ def known(monkeypatch):
             return np.sqrt(regular(scheme, dt) ** 2 + true.square(scheme, dt, 20.0))
 
         monkeypatch.setattr(choice, "measure_errors", measure_errors)
-        monkeypatch.setattr(walk, "measure_errors", measure_errors)
         methods = {name: Method(None, scheme) for name, scheme in SCHEMES.items()}
         trial_system = TrialSystem(
             "", None, methods, None, "", "", 1.0, 1.0, 0.1, "fs", 1e-3, "", "", None, True, freedom=600
@@ -174,16 +172,16 @@ def known(monkeypatch):
 @pytest.mark.parametrize("jump", [0.0, 2.0, 5.0])
 def test_the_error_asked_for_holds_over_the_whole_run_and_not_only_the_pilot(jump, target, known):
     trial_system, longest, error = known(jump)
-    found = choose(trial_system, target, "energy_rms", longest, 20.0)
+    found = choose(trial_system, longest, target, duration=20.0)
     assert target / 5 < error(found) < target
     assert "over 20 ps for a target of" in found.reason
     assert found.error == pytest.approx(error(found), rel=0.5)
-    assert error(choose(trial_system, target, "energy_rms", longest)) > error(found)
+    assert error(choose(trial_system, longest, target)) > error(found)
 
 
 def test_a_walk_that_no_step_makes_smaller_is_reported_with_what_helps(known):
     trial_system, longest, error = known(-1.0)
-    found = choose(trial_system, 2e-5, "energy_rms", longest, 20.0)
+    found = choose(trial_system, longest, 2e-5, duration=20.0)
     assert found.error == pytest.approx(error(found), rel=0.5)
     assert found.error > 2e-5
     assert "no step tried keeps the target over that time: truncation = 'smooth_switch', a longer" in found.reason

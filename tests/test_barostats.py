@@ -75,7 +75,7 @@ def liquid(request):
     system, engine, state = built(
         {"spce": 20, "nitrogen": 12}, 12.0, 3, spread=0.1, forces=forces, stages=[stage], box=box
     )
-    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    remove_overlaps(system, engine, state, THERMAL, 0.002)
     return system, engine, state
 
 
@@ -237,7 +237,7 @@ def compressed():
     stage = {"ensemble": "nph", "pressure_bar": 2000.0, "duration_ps": 0.1, "barostat_time_ps": 0.3}
     forces = {"cutoff_A": 4.5, "truncation": "smooth_switch", "tail_correction": True}
     system, engine, state = built({"nitrogen": 32}, 11.5, 2, spread=0.1, forces=forces, stages=[stage])
-    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.3, THERMAL, 0.002)
+    remove_overlaps(system, engine, state, THERMAL, 0.002)
     bath = Langevin(constant_ramp(THERMAL), 20.0, 20.0, key_of(1, THERMOSTAT))
     move(engine, state, WITH_THERMOSTAT["baoab"].with_thermostat(bath), 0.002, 300)
     state.velocity[:] -= state.velocity.mean(axis=0)

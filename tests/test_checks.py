@@ -145,7 +145,7 @@ def test_a_load_that_is_no_number(name):
     getattr(load, name)[5, 1] = np.nan
     check = watch.StepCheck(system, system.scene.watch)
     check.thermal = 250.0
-    found = check.check_step(system.state, load, SCHEMES["velocity_verlet"], 0.002)
+    found = check.failed_check(system.state, load, SCHEMES["velocity_verlet"], 0.002)
     assert str(found) == f"the {name.removesuffix('_body')} on molecule 6 (spce) is not finite"
 
 
@@ -162,7 +162,7 @@ def test_a_bound_on_all_molecules_hides_no_finding(monkeypatch, name):
     def findings(m):
         for size in np.geomspace(1.0, 1e9, 180):
             number[m, 1] = size
-            found = check.check_step(system.state, load, verlet, 0.002)
+            found = check.failed_check(system.state, load, verlet, 0.002)
             yield found and str(found)
         number[m, 1] = 0.0
 

@@ -25,7 +25,7 @@ from support import (
     SCHEMES,
     Engine,
     Figures,
-    RunTimes,
+    MolecularRecord,
     Sample,
     Samples,
     State,
@@ -437,7 +437,9 @@ def summarised(stage, counts=None, momentum=0.0, truncation="switch", seed=0, **
         own = {name: float(values[k]) for name, values in made.items()}
         row = dict.fromkeys(COLUMNS, 0.0) | plain | {"stage_name": "", "step": k, "stage": 0, "kinetic": 100.0}
         rows.append(Sample(**row | {"time": 0.05 * k, "momentum": momentum, "orthogonality_error": 0.0} | own))
-    return summarise(system, rows, state, 0, RunTimes(0.0, 1.0, [1.0]), False, {}, {}, {}, {}, [])
+    record = MolecularRecord()
+    record.position.computing = [1.0]
+    return summarise(system, record, rows, state, 0.0, 1.0, False)
 
 
 def noted(*given, **made):

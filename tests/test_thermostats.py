@@ -126,7 +126,7 @@ def liquid():
     """27 waters and 5 nitrogens, relieved, with momenta: system, state."""
     system, engine, state = built({"spce": 27, "nitrogen": 5}, 12.0, spread=0.1, forces={
         "cutoff_A": 5.0, "truncation": "smooth_switch", "switch_start_A": 3.0})  # fmt: skip
-    remove_overlaps(system.model, engine, state, np.array([m.radius for m in system.species]), 3.2, THERMAL, 0.002)
+    remove_overlaps(system, engine, state, THERMAL, 0.002)
     move(
         engine,
         state,

@@ -55,7 +55,15 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
     position, velocity, rotation, omega = system.motion(times, states)
     columns = {"time": times} | _columns("position", position) | _columns("velocity", velocity)
     if system.rotates:
-        columns |= _rotation_columns(system, times, states, rotation, omega)
+        columns |= _columns("rotation", rotation.reshape(-1, 9))
+        columns |= _columns("quaternion", _continuous(to_quaternion(rotation)))
+        columns |= _columns("euler_angles", to_euler_angles(rotation))
+        if isinstance(system.body.rotor, DrivenRotor):
+            columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
+        momentum = states.angular_momentum_body.reshape(-1, 3) @ system.axes.T
+        for name, body in (("omega", omega), ("L", momentum)):
+            columns |= _columns(f"{name}_body", body)
+            columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
     columns |= energies(system, times, states)
     errors = _errors(system, columns)
     columns |= {f"{name}_error": error for name, error in errors.items()}
@@ -68,22 +76,6 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
 def _columns(family: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of a family from values (t, n)."""
     return dict(zip(BODY[family].names, values.T, strict=True))
-
-
-def _rotation_columns(
-    system: BodySystem, times: np.ndarray, states: State, rotation: np.ndarray, omega: np.ndarray
-) -> dict[str, np.ndarray]:
-    n = len(rotation)
-    momentum = states.angular_momentum_body.reshape(n, 3) @ system.axes.T
-    columns = _columns("rotation", rotation.reshape(n, 9))
-    columns |= _columns("quaternion", _continuous(to_quaternion(rotation)))
-    columns |= _columns("euler_angles", to_euler_angles(rotation))
-    if isinstance(system.body.rotor, DrivenRotor):
-        columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
-    for name, body in (("omega", omega), ("L", momentum)):
-        columns |= _columns(f"{name}_body", body)
-        columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
-    return columns
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Observables of molecules at one state: energies, temperatures, pressure, momentum and the orthogonality of Q."""
 
 from math import hypot, inf, nan
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -10,6 +10,10 @@ from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
+from rigidmd.forces.ewald.interactions import NEUTRAL
+from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.potentials.coulomb import ReactionField
+from rigidmd.forces.potentials.truncation import Unmodified
 from rigidmd.units import BAR, BOLTZMANN, GRAM_PER_CM3, KJ_PER_MOL
 
 UNIT = np.eye(3)
@@ -123,3 +127,51 @@ def kinetic_energies(system: System, state: State) -> tuple[float, float]:
 
 def _temperature(kinetic: float, freedom: int) -> float:
     return 2 * kinetic / (freedom * BOLTZMANN) if freedom else nan
+
+
+def describe_quantities(system: System) -> dict[str, str]:
+    """Explanations for `rigidmd energy`: name of an energy of charges, `virial` or `pressure` -> text."""
+    method, found = system.scene.forces.electrostatics, {}
+    if method == "reaction_field" and system.cutoff < inf and "coulomb" in system.terms:
+        found = _describe_reaction_field(system)
+    elif method in ("ewald", "pme"):
+        found = _describe_ewald(system)
+    found = {name: text for name, text in found.items() if name in {*system.terms, *system.constants}}
+    if system.space.volume == inf:
+        return found
+    virial, pressure = "sum of F·R over molecules", "(2 K of translation + virial)/3 V"
+    if system.external:
+        virial += ", of the forces between molecules; fields, walls and restraints do not contribute"
+    if system.tail is not None:
+        virial += ", without the tail correction"
+        pressure += f", and {system.tail.pressure(system.state.volume) / BAR:.10g} bar of the tail"
+    if "coulomb_frozen" in system.constants:
+        constant = f"{system.constant_pressure / BAR:.10g} bar"
+        pressure += f", and {constant}, which removes the forces between frozen molecules"
+    return found | {"virial": virial, "pressure": pressure}
+
+
+def _describe_reaction_field(system: System) -> dict[str, str]:
+    name = system.scene.forces.truncation
+    shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).potential).truncation
+    start = 0.0 if isinstance(shape, Unmodified) else shape.start
+    ends = {
+        "plain": "", "shift": ", less its value at the cutoff", "force_shift": ", less its value and slope there",
+        "force_switch": f", its force switched off from {start:g} Å on",
+    }  # fmt: skip
+    how = ends.get(name, f", less its value at the cutoff, times {name} from {start:g} Å on")
+    return {
+        "coulomb": f"q q (1/r + k r²) up to the cutoff{how}",
+        "reaction_field_self": "charges of each molecule in their own reaction field",
+    }
+
+
+def _describe_ewald(system: System) -> dict[str, str]:
+    """The real-space energy may be shifted."""
+    real, self_energy = "q q erfc(alpha r)/r between molecules", "-alpha/sqrt(pi) q² of each site"
+    if system.scene.forces.ewald_truncation == "plain":
+        return {"coulomb_real": f"{real}, plain at the cutoff", "coulomb_self": self_energy}
+    more = "; shifted energies add nothing to it, as every molecule is neutral"
+    if any(abs(m.charge) > NEUTRAL * np.abs(m.charges).sum() for m in system.species):
+        more = ", and -erfc(alpha R)/(2 R) (sum of q)² of each molecule, as energies are shifted; R is the cutoff"
+    return {"coulomb_real": f"{real}, less its value at the cutoff", "coulomb_self": self_energy + more}

@@ -3,6 +3,7 @@
 One table serves files, displays and documentation. For molecules it is the record `Sample`: each field has a `Column`.
 """
 
+from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
@@ -109,7 +110,7 @@ MATRIX = "Q"
 BODY_COLUMNS = {n: Column("t" if n == "time" else n, f.unit, f.about) for f in BODY.values() for n in f.names}
 
 
-class SampleTable:
+class SampleTable(ABC):
     """The samples of a run as arrays by the names of their columns, which `described` has."""
 
     described: dict[str, Column]
@@ -126,8 +127,8 @@ class SampleTable:
             raise KeyError(f"no column {column!r}; there are {', '.join(self.described)}")
         return self._array(column)
 
-    def _array(self, name: str) -> np.ndarray:
-        raise NotImplementedError
+    @abstractmethod
+    def _array(self, name: str) -> np.ndarray: ...
 
     @property
     def written(self) -> dict[str, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from rigidmd.run.observers import Every, Moment, Observer
 from rigidmd.run.results import Results
-from rigidmd.run.simulation import Simulation
-from rigidmd.run.together import run_together
+from rigidmd.run.simulation import Simulation, run_together
 
 __all__ = ["Every", "Moment", "Observer", "Results", "Simulation", "run_together"]

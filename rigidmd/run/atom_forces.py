@@ -1,4 +1,4 @@
-"""Forces on the atoms of rigid molecules, in two forms that have the same total force and torque on each molecule.
+"""Runs of molecules as `ase.Atoms`; forces on atoms, in two forms with the same totals on each molecule.
 
 `gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's force F and torque,
 
@@ -13,23 +13,36 @@ distances reduce any other form to them. K is the inertia tensor of molecules th
 inside molecules are included; constraints have to balance them.
 """
 
-from typing import Any, Literal, cast
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from rigidmd.core.state import Load, State
+from rigidmd.core.process import ignore_warnings
+from rigidmd.core.state import NOW, State
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
-from rigidmd.io.formats.through_ase import EV
+from rigidmd.io.formats import format_of
+from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
 from rigidmd.run.force_errors import forces_inside
+from rigidmd.run.rigid_fit import kinds_of
 from rigidmd.scene.models import Molecule
-from rigidmd.units import BAR
+from rigidmd.units import BAR, KJ_PER_MOL
 
+if TYPE_CHECKING:
+    import ase
+
+    from rigidmd.run.results import Results
+
+
+#: Times of a run that differ by less than this fraction are equal.
+SAME_TIME = 1e-9
 #: Distance of a massless site from a linear combination of the atoms that is rounding, as a fraction of the radius.
 COMBINATION_TOLERANCE = 1e-9
 #: Smaller moments of inertia, as fractions of the largest, are 0, as one moment of linear molecules is.
@@ -41,6 +54,78 @@ Form = Literal["gradient", "sites"]
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
+def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "ase.Atoms | list[ase.Atoms]":
+    """See `Results.atoms`."""
+    from ase.calculators.singlepoint import SinglePointCalculator
+
+    system, state, frames = results.system, results.state, results._frames
+    if not isinstance(system, System):
+        raise ValueError("this is a run of a single body, which has no atoms")
+
+    def final() -> "ase.Atoms":
+        """The final state, exactly, with its energy, forces and stress."""
+        found = atoms_of_system(system, state, system.scene.output.positions == "wrapped")
+        found.info["time_ps"] = float(state.time[NOW])
+        found.calc = SinglePointCalculator(found, **ase_results(system, system.engine(), state))
+        return found
+
+    if frame is None:
+        return final()
+    if not frames:
+        raise ValueError("this run has no frames (output.trajectory = false); atoms() is the final state")
+    indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
+    times, energies, found = results["time"], results["potential"], []
+    for k in indices:
+        time = frames[k].time
+        if k == len(frames) - 1 and _same(time, float(state.time[NOW])):
+            found.append(final())
+            continue
+        found.append(atoms_of_sites(system, *sites(k), time))
+        if len(same := np.flatnonzero(_same(times, time))):
+            energy = energies[same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
+            found[-1].calc = SinglePointCalculator(found[-1], energy=float(energy))
+    return found if isinstance(indices, range) else found[0]
+
+
+def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
+    """Indices of frames: a range for several, a list of one for an index. Raises IndexError, ValueError."""
+    wanted: Any = frame
+    if isinstance(frame, str):
+        with contextlib.suppress(ValueError):
+            parts = [int(part) if part.strip() else None for part in frame.split(":")]
+            wanted = parts[0] if len(parts) == 1 else slice(*parts) if len(parts) < 4 else frame
+    if isinstance(wanted, slice) and wanted.step != 0:
+        return range(count)[wanted]
+    if not isinstance(wanted, int | np.integer):
+        raise ValueError(f"frame is {frame!r}, must be a number, a slice or a text like '-1' or '::10'")
+    if not -count <= wanted < count:
+        raise IndexError(f"frame {wanted} is out of range: this run has {count}")
+    return [int(wanted) % count]
+
+
+def _sites_of_frames(results: "Results") -> Callable[[int], tuple[Any, Any, Any]]:
+    """A function of k that gives positions, velocities and cell of frame k, from the files if there are any."""
+    from rigidmd.io.trajectory import read_exactly  # MDAnalysis is slow to import
+
+    exact = next((path for path in results.files if (form := format_of(path)) is not None and form.double), None)
+    if exact is not None or not results.files:
+        frames = results._frames if exact is None else read_exactly(exact)
+        return lambda k: frames[k].sites
+    with ignore_warnings():  # frames that are not evenly spaced: each has its time
+        trajectory = cast(Any, results.universe().trajectory)
+
+    def sites(k: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        frame = trajectory[k]
+        cell = None if frame.dimensions is None else frame.triclinic_dimensions
+        return frame.positions, frame.velocities if frame.has_velocities else None, cell
+
+    return sites
+
+
+def _same(time: Any, other: float) -> Any:
+    return np.abs(time - other) <= SAME_TIME * max(abs(other), 1.0)
+
+
 def ase_results(
     system: System, engine: CpuEngine, state: State, form: Form = "gradient", atoms: np.ndarray | None = None
 ) -> dict[str, Any]:
@@ -48,69 +133,40 @@ def ase_results(
 
     The stress is from the molecular virial, without the ideal part: the derivative of the energy for a strain that
     moves centres of mass and rotates nothing, over the volume.
+
+    atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
     still = state._replace(
         velocity=np.zeros_like(state.velocity), angular_momentum_body=np.zeros_like(state.angular_momentum_body)
     )
     seen = observe(system, engine, still, energy_unit=EV)
-    force = gradient_forces(system, state, seen.load, atoms)
+    load, torque = seen.load, np.zeros_like(seen.load.force)
+    if len(state.rotation):
+        torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
     if form == "sites":
-        force = site_forces(system, engine, state, seen.load, atoms)
+        force = site_forces(system, engine, state, load.force, torque, atoms)
+    else:
+        force = gradient_forces(system, state, load.force, torque, atoms)
     found = {"energy": seen.potential, "forces": force / EV}
     if np.isfinite(state.cell).all():
         found["stress"] = np.array([-seen.pressure_tensor_bar[at] for at in VOIGT]) * (BAR / EV)
     return found
 
 
-def gradient_forces(system: System, state: State, load: Load, atoms: np.ndarray | None = None) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file, with the totals of `load`.
-
-    atoms : positions (a, 3) where they are not those of rigid molecules, Å
-    """
-    return _gradient_forces(system, state, load.force, _torque_lab(state, load), atoms)
-
-
-def site_forces(
-    system: System, engine: CpuEngine, state: State, load: Load, atoms: np.ndarray | None = None
-) -> np.ndarray:
-    """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with the totals of `load`.
-
-    engine : has just evaluated `load` at the state. Forces on whole molecules, such as gravity, are in the first form.
-    """
-    force = np.zeros((system.site_count, 3))
-    arm = _site_arms(system, state)
-    for name, workspace in engine.workspaces.items():
-        sites = getattr(workspace, "sites", None)
-        if not hasattr(workspace, "site_force") or not isinstance(sites, BodySites | CentralSites):
-            continue
-        on_site = np.array(cast(Any, workspace).site_force)
-        at = _site_indices(system, sites)
-        if name.endswith("reciprocal"):
-            real = cast(PairForces, system.terms[name.replace("reciprocal", "real")])
-            law = cast(ScreenedCoulomb, real.potential)
-            position = (state.position[system.sites.molecule] + arm)[at]
-            on_site = on_site + forces_inside(law.charge, position, sites.first, law.alpha)
-        np.add.at(force, at, on_site)
-    atom = system.sites.mass > 0
-    found = force[atom] + _massless_forces_on_atoms(system, state, force)[atom]
-    of_atom, n = system.sites.molecule[atom], len(state.position)
-    rest = load.force - _sum_per_molecule(of_atom, found, n)
-    torque = _torque_lab(state, load) - _sum_per_molecule(
-        of_atom, np.cross(_from_centre(system, state, arm, atoms), found), n
-    )
-    return found + _gradient_forces(system, state, rest, torque, atoms)
-
-
-def _gradient_forces(
+def gradient_forces(
     system: System, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
 ) -> np.ndarray:
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the first form of this file.
+
+    force, torque (n, 3) : of the molecules, lab frame; atoms : as in `ase_results`
+    """
     atom = system.sites.mass > 0
     of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
     total = system.model.mass[system.model.species][:, None]
     found = mass * (force / total)[of_atom]
     if len(state.rotation):
-        arm = _site_arms(system, state)
-        y, r = arm[atom], _from_centre(system, state, arm, atoms)
+        arm, r = _arms(system, state, atoms)
+        y = arm[atom]
         moments = _sum_per_molecule(of_atom, mass[..., None] * y[:, :, None] * r[:, None, :], len(force))
         moments = 0.5 * (moments + moments.swapaxes(1, 2))  # it is symmetric where the fit is the best
         tensor = moments.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
@@ -119,20 +175,39 @@ def _gradient_forces(
     return found
 
 
-def _site_arms(system: System, state: State) -> np.ndarray:
-    """Positions (s, 3) of sites from their centres of mass, lab frame."""
-    return system.site_positions(state) - state.position[system.sites.molecule]
+def site_forces(
+    system: System, engine: CpuEngine, state: State, force: np.ndarray, torque: np.ndarray, atoms: np.ndarray | None
+) -> np.ndarray:
+    """Forces (a, 3) on the sites with mass, u Å/ps²: the second form, with total force and torque (n, 3), lab frame.
 
-
-def _from_centre(system: System, state: State, arm: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
+    engine : has just evaluated them at the state. Forces on whole molecules, such as gravity, are in the first form.
+    """
+    on_sites = np.zeros((system.site_count, 3))
+    arm, from_centre = _arms(system, state, atoms)
+    for name, workspace in engine.workspaces.items():
+        sites = getattr(workspace, "sites", None)
+        if not hasattr(workspace, "site_force") or not isinstance(sites, BodySites | CentralSites):
+            continue
+        of_term = np.array(cast(Any, workspace).site_force)
+        at = _site_indices(system, sites)
+        if name.endswith("reciprocal"):
+            real = cast(PairForces, system.terms[name.replace("reciprocal", "real")])
+            law = cast(ScreenedCoulomb, real.potential)
+            position = (state.position[system.sites.molecule] + arm)[at]
+            of_term = of_term + forces_inside(law.charge, position, sites.first, law.alpha)
+        np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
-    return arm[atom] if atoms is None else atoms - state.position[system.sites.molecule[atom]]
+    found = on_sites[atom] + _massless_forces_on_atoms(system, state, on_sites)[atom]
+    of_atom, n = system.sites.molecule[atom], len(state.position)
+    rest = force - _sum_per_molecule(of_atom, found, n)
+    torque = torque - _sum_per_molecule(of_atom, np.cross(from_centre, found), n)
+    return found + gradient_forces(system, state, rest, torque, atoms)
 
 
-def _torque_lab(state: State, load: Load) -> np.ndarray:
-    if len(state.rotation) == 0:
-        return np.zeros_like(load.force)
-    return np.einsum("nij,nj->ni", state.rotation, load.torque_body)
+def _arms(system: System, state: State, atoms: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Positions from the centres of mass, lab frame: (s, 3) of the sites, (a, 3) of the atoms."""
+    arm, atom = system.site_positions(state) - state.position[system.sites.molecule], system.sites.mass > 0
+    return arm, arm[atom] if atoms is None else atoms - state.position[system.sites.molecule[atom]]
 
 
 def _sum_per_molecule(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
@@ -143,35 +218,29 @@ def _sum_per_molecule(owner: np.ndarray, values: np.ndarray, n: int) -> np.ndarr
 
 def _site_indices(system: System, sites: BodySites | CentralSites) -> np.ndarray:
     """Index (s,) of the sites of a pair potential among all sites."""
-    counts = np.array([len(m.masses) for m in system.species])[system.model.species]
-    begin = np.cumsum(counts) - counts
     offset, found = sites.offsets(), np.zeros(len(sites.molecule), int)
-    for k, m in enumerate(system.species):
-        members = np.flatnonzero(system.model.species == k)
-        members = members[np.diff(sites.first)[members] > 0]
-        if len(members) == 0:
-            continue
-        of_first = np.arange(int(sites.first[members[0]]), int(sites.first[members[0] + 1]))
-        nearest = cdist(offset[of_first], m.positions_body).argmin(axis=1)
-        found[sites.first[members][:, None] + np.arange(len(of_first))] = begin[members][:, None] + nearest
+    for kind in kinds_of(system):
+        has_sites = np.diff(sites.first)[kind.index] > 0
+        first = sites.first[kind.index[has_sites]]
+        if len(first):
+            count = int(sites.first[kind.index[has_sites][0] + 1] - first[0])
+            nearest = cdist(offset[first[0] : first[0] + count], kind.molecule.positions_body).argmin(axis=1)
+            found[first[:, None] + np.arange(count)] = kind.sites[has_sites][:, nearest]
     return found
 
 
 def _massless_forces_on_atoms(system: System, state: State, force: np.ndarray) -> np.ndarray:
     """Forces (s, 3) on the atoms that are equivalent to the forces (s, 3) on massless sites."""
     found = np.zeros_like(force)
-    counts = np.array([len(m.masses) for m in system.species])[system.model.species]
-    begin = np.cumsum(counts) - counts
-    for k, m in enumerate(system.species):
+    for kind in kinds_of(system):
+        m = kind.molecule
         bare, heavy = np.flatnonzero(m.masses == 0), np.flatnonzero(m.masses > 0)
         if len(bare) == 0:
             continue
-        first = begin[system.model.species == k][:, None]
-        rotation = state.rotation if len(state.rotation) else np.tile(np.eye(3), (len(counts), 1, 1))
-        Q = rotation[system.model.species == k]
+        Q = state.rotation[kind.index] if len(state.rotation) else np.tile(np.eye(3), (len(kind.index), 1, 1))
         matrices = np.array([_transfer_matrices(m, int(site)) for site in bare])  # (bare, heavy, 3, 3)
-        body = np.einsum("nij,nbi->nbj", Q, force[first + bare])
-        found[first + heavy] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
+        body = np.einsum("nij,nbi->nbj", Q, force[kind.sites[:, bare]])
+        found[kind.sites[:, heavy]] = np.einsum("nij,bhjk,nbk->nhi", Q, matrices, body)
     return found
 
 

@@ -4,34 +4,213 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.body import build_body
 from rigidmd.compile.cache import describe_cache
-from rigidmd.core.integrators import Scheme
-from rigidmd.core.state import NOW, ORIGIN
-from rigidmd.engines.body_motion import Motion, Snapshot, motion
+from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
+from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
-from rigidmd.engines.protocol import Engine
+from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
+from rigidmd.figures.body import FIGURES, body_figures, write_motion_figures
+from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.folder import MOTION, MOTION_NPZ
 from rigidmd.io.formats import format_of
-from rigidmd.run.body_observers import BodyWatch, Figures, MotionFiles, Sampler
+from rigidmd.io.write import write_columns, write_npz
+from rigidmd.mechanics.rotation import orthogonality_error
+from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import fastest_body_rate, stable_angle
 from rigidmd.run.report import body_summary_text
-from rigidmd.run.resume import RunRecord, check_same_scene, state_from
-from rigidmd.run.segments import RunTimes, Segment
+from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
+from rigidmd.run.schedule import Segment
 from rigidmd.run.signals import interruptible
 from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
+    from rigidmd.run.results import Results
     from rigidmd.run.simulation import Simulation
+
+
+#: Most evaluations of forces between two checks, and most samples.
+EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 1_000_000, 512
+
+
+class Sampler(Observer):
+    """Keeps snapshots, of which columns are made at the end."""
+
+    remembers: ClassVar[dict[str, Any]] = {"stacked": Arrays}
+    ends = True
+
+    def __init__(self, interval: float):
+        self.interval = interval
+        self.snapshots: list[Snapshot] = []
+
+    @property
+    def stacked(self) -> dict[str, np.ndarray]:
+        """The arrays of all snapshots, by name."""
+        found = {name: np.array([seen.state[k] for seen in self.snapshots]) for k, name in enumerate(STORED_NAMES)}
+        return found | {"t": np.array([seen.time for seen in self.snapshots])}
+
+    @stacked.setter
+    def stacked(self, stacked: dict[str, np.ndarray]) -> None:
+        times = stacked.pop("t")
+        states = [State(*(stacked[name][k] for name in STORED_NAMES)) for k in range(len(times))]
+        self.snapshots = [Snapshot(time, state) for time, state in zip(times.tolist(), states, strict=True)]
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        super().resume(run, kept)
+        times = np.array([seen.time for seen in self.snapshots])
+        if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.state.time[NOW]).all()):
+            raise ValueError("the times of its samples cannot be of a run")
+        for seen in self.snapshots:
+            state_from(dict(zip(STORED_NAMES, seen.state, strict=True)), run.state, exact=False)
+
+    def see(self, moment: Moment) -> None:
+        self.snapshots.append(Snapshot(moment.time, moment.state))
+
+
+class BodyWatch(Observer):
+    """Checks the state against the limits of the scene, independent of the interval of samples.
+
+    exchanged : the largest energy exchanged so far (J), to which errors of the energy are relative
+    """
+
+    remembers: ClassVar[dict[str, Any]] = {"exchanged": NotNegative}
+    ends = True
+
+    def __init__(self, run: "Simulation"):
+        self._run, self._system, self._limits = run, run.system, run.scene.watch
+        system, every = run.system, max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
+        # at most half a second of computing
+        self.steps = min(
+            EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1), SAMPLES_PER_CHECK * every
+        )
+        self._start = self._energies(system.state)
+        weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
+        swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
+        self.exchanged = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * float(swing))
+
+    def resume(self, run: "Simulation", kept: Checkpoint) -> None:
+        least = self.exchanged
+        super().resume(run, kept)
+        if self.exchanged < least:
+            raise ValueError(f"it has exchanged an energy of {self.exchanged:g} J")
+        if problem := self._failed_check(run.state, run.scene.run.timestep_s):
+            raise ValueError(f"its state cannot be of this run: {problem}")
+
+    def see(self, moment: Moment) -> None:
+        if problem := self._failed_check(self._run.state, self._run.segment.dt):
+            raise problem
+
+    def _energies(self, state: State) -> dict[str, float]:
+        columns = energies(self._system, state.time[:1], State(*(array[None] for array in state)))
+        return {name: float(values[0]) for name, values in columns.items()}
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _failed_check(self, state: State, dt: float) -> FailedCheck | None:
+        system, limits = self._system, self._limits
+        largest = not_none(limits.orthogonality)
+        if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
+            message = f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
+            return FailedCheck(message, rotation_not_orthogonal=True)
+        if system.rotates and limits.turn_rad:
+            omega = system.pose(float(state.time[0]), state).angular_velocity_body
+            angle = dt * float(np.linalg.norm(omega))
+            if angle > limits.turn_rad:
+                message = f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
+                return FailedCheck(message, factor=angle / limits.turn_rad)
+        if not limits.energy or not is_balanced(system):
+            return None
+        start, now = self._start, self._energies(state)
+        self.exchanged = max(self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
+        error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
+        scale = self.exchanged + ROUNDING * abs(now["energy"])
+        if error <= limits.energy * scale:
+            return None
+        return FailedCheck(
+            f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
+            f"energy exchanged (watch.energy = {limits.energy:g})"
+        )
+
+    def explain(self, error: SimulationError, stable: float | None) -> str:
+        """The message of a failed check in full: what was observed, the likely cause, what to try.
+
+        stable : the longest stable step, s
+        """
+        system, dt = self._system, self._run.segment.dt
+        if isinstance(error, NotFiniteError):
+            failed = FailedCheck("position or momentum of the body is not finite")
+        elif isinstance(error, FailedCheck):
+            failed = error
+        else:
+            return str(error)
+        shorter = f"a shorter timestep_s than {dt:g}"
+        if stable is not None and stable < dt:
+            shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
+        elif failed.factor is not None:
+            shorter = f"timestep_s = {dt / failed.factor:.2g} or less"
+        inertia, advice = system.inertia, shorter
+        if failed.rotation_not_orthogonal:
+            likely = "Q was changed from outside: a run only multiplies rotations"
+            if isinstance(system.method, Solver):
+                likely = f"only accuracy keeps Q a rotation under {system.method.name}"
+            advice = f"integrator = 'srkn_6', which keeps Q, or {shorter}"
+        elif system.rotates and (least := inertia[inertia > 0].min()) < MIN_INERTIA_FRACTION * inertia.max():
+            likely = (
+                f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
+                "and the body spins about that axis faster than the step can follow"
+            )
+            advice = f"{shorter}, or a moment of 0"
+        else:
+            likely = "timestep_s is too long for this motion, or a force grows without bound"
+        return f"{failed}. Likely cause: {likely}. Try {advice}"
+
+
+class MotionFiles(Observer):
+    """motion.csv and motion.npz."""
+
+    _names = (MOTION, MOTION_NPZ)
+
+    def __init__(self, sampler: Sampler, npz: bool):
+        self._sampler, self._npz = sampler, npz
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        for name, write in ((MOTION, write_columns), (MOTION_NPZ, write_npz))[: 2 if self._npz else 1]:
+            write(run.path(name), results.samples.written)
+            results.files.append(run.path(name))
+
+    def failed(self, run: "Simulation") -> str:
+        if not self._sampler.snapshots:
+            return ""
+        write_columns(run.path(MOTION), motion(run.system, self._sampler.snapshots).written)
+        return f". The motion so far: {run.path(MOTION)}"
+
+
+class Figures(Observer):
+    """Figures of the axis, angles, omega and errors."""
+
+    draws = True
+    _names = tuple(f"{figure}.{suffix}" for figure in FIGURES for suffix in ("png", "svg"))
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        failed = None
+        for stem, figure in body_figures(run.system, cast(Motion, results.samples)).items():
+            try:
+                results.files += write_motion_figures(run.path(""), {stem: figure})
+            except Exception as error:  # of many types; the other figures are drawn first
+                failed = failed or error
+        if failed is not None:
+            raise failed
 
 
 @dataclass
@@ -141,9 +320,10 @@ class BodyRun(RunPart):
     def samples(self) -> Motion:
         return motion(self.system, self._sampler.snapshots)
 
-    def summary(self, samples: Motion, times: RunTimes) -> dict[str, Any]:
+    def summary(self, samples: Motion, preparing: float, wall: float) -> dict[str, Any]:
         steps = sum(segment.steps for segment in self._segments)
-        found = summarise_body(self.system, samples, steps, times, self.simulation.is_interrupted)
+        computing, interrupted = sum(self.record.position.computing), self.simulation.is_interrupted
+        found = summarise_body(self.system, samples, steps, preparing, wall, computing, interrupted)
         found["stable_timestep_s"] = self.record.stable
         if self.engine.is_stiff:
             self.simulation.note(
@@ -154,7 +334,7 @@ class BodyRun(RunPart):
         return found
 
     def explain(self, error: SimulationError) -> str:
-        return self._watch.check.explain(error, self.segment.dt, self.record.stable)
+        return self._watch.explain(error, self.record.stable)
 
     @property
     def headline(self) -> str:

@@ -10,24 +10,17 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.start import OVERLAP, close_pairs, every_site
-from rigidmd.core.integrators import Scheme, Solver
+from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, largest_values
-from rigidmd.engines.body_motion import energies, is_balanced
-from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.cpu.engine import BehindWallError
 from rigidmd.engines.protocol import NotFiniteError
 from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.applied import SteadyForce
-from rigidmd.mechanics.rotation import orthogonality_error
-from rigidmd.scene.body import BodyWatch
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.molecules import Watch
-from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
@@ -38,8 +31,8 @@ CHARGED_OVERLAP, CHARGES_OVERLAP = 0.3, 1.0
 MIN_INERTIA_FRACTION = 0.01
 #: Rounding may change a potential energy by this fraction, half of its digits.
 ROUNDING = sqrt(np.finfo(float).eps)
-#: Most moves of molecules between two checks; for a body, most evaluations of its forces, and most samples.
-MOVES_PER_CHECK, EVALUATIONS_PER_CHECK, SAMPLES_PER_CHECK = 250_000, 1_000_000, 512
+#: Most moves of molecules between two checks.
+MOVES_PER_CHECK = 250_000
 
 
 class FailedCheck(SimulationError):
@@ -56,31 +49,12 @@ class FailedCheck(SimulationError):
     ):  # fmt: skip
         super().__init__(message)
         self.molecule, self.factor = molecule, factor
-        self.rotation_not_orthogonal = rotation_not_orthogonal
-        self.evaporated = evaporated
-
-
-class Cause(NamedTuple):
-    """The likely cause of a failed check, and what to try."""
-
-    likely: str
-    advice: str
+        self.rotation_not_orthogonal, self.evaporated = rotation_not_orthogonal, evaporated
 
 
 def check_interval(system: System) -> int:
     """Steps between two checks of molecules, which cost less than 1 % of the steps."""
     return max(20, MOVES_PER_CHECK // len(system.model.species))
-
-
-def steps_between(system: System) -> int | None:
-    """Steps between two checks besides those of samples; None where samples come at least as often."""
-    interval = system.scene.output.log_interval_ps
-    steps = [
-        inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
-        for stage in system.scene.stages
-        if not stage.is_minimisation
-    ]
-    return check_interval(system) if max(steps, default=0.0) > check_interval(system) else None
 
 
 class StepCheck:
@@ -103,54 +77,40 @@ class StepCheck:
         """Set the scale of momenta by a kinetic energy (u Å²/ps²): its kT, or the deepest well if that is larger."""
         self.thermal = max(2 * kinetic / max(self._system.freedom.total, 1), self._deepest_well)
 
-    def failed_check(self, state: State, load: Load, stage: Stage, extent: LargestValues | None) -> FailedCheck | None:
-        """The failed check of a stage's next step, if the stage has steps; see `check_step`."""
-        if stage.is_minimisation:
-            return None
-        return self.check_step(state, load, stage.scheme, stage.timestep_fs * FEMTOSECOND, extent)
-
-    def check_step(
+    @np.errstate(over="ignore", invalid="ignore")
+    def failed_check(
         self, state: State, load: Load, scheme: Scheme, dt: float, extent: LargestValues | None = None
     ) -> FailedCheck | None:
         """The failed check of the next step: a force that is not finite, or too large a kick, move or rotation.
 
         load : at this state or at the last kick; extent : of both, if it is known
         """
-        largest = extent or largest_values(state, load)
-        return (
-            None if self._is_within_limits(largest, scheme, dt) else self._check_each_molecule(state, load, scheme, dt)
-        )
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _check_each_molecule(self, state: State, load: Load, scheme: Scheme, dt: float) -> FailedCheck | None:
+        if self._is_within_limits(extent or largest_values(state, load), scheme, dt):
+            return None
         system, limits, model = self._system, self._limits, self._system.model
         for what, values in (("force", load.force), ("torque", load.torque_body)):
             if not np.isfinite(values).all():
                 m = int((~np.isfinite(values).all(axis=1)).argmax())
                 return FailedCheck(f"the {what} on {molecule_label(system, m)} is not finite", m)
+        found: list[tuple[np.ndarray, float, str]] = []  # a measure (n,), its limit, a message about its largest value
         if limits.kick and self.thermal > 0:
             size = kicks(model, load, self.thermal, dt * max(map(abs, scheme.kicks)))
-            if size.max() > limits.kick:
-                m = int(size.argmax())
-                which = molecule_label(system, m)
-                message = f"one kick changes a momentum of {which} by {size[m]:.3g} times its thermal size"
-                return FailedCheck(f"{message} (watch.kick = {limits.kick:g})", m, factor=size[m] / limits.kick)
-        stride = dt * max(map(abs, scheme.drifts))
+            times = f"by {size.max():.3g} times its thermal size (watch.kick = {limits.kick:g})"
+            found.append((size, limits.kick, f"one kick changes a momentum of {{}} {times}"))
+        stride, between = dt * max(map(abs, scheme.drifts)), "between two force evaluations"
         if limits.move:
             way = stride * np.sqrt((state.velocity**2).sum(axis=1)) * load.force.any(axis=1)
-            m, diameter = int(way.argmax()), self._diameter
-            if way[m] > limits.move * diameter:
-                message = f"{molecule_label(system, m)} moves {way[m]:.3g} Å between two force evaluations, "
-                message += f"{way[m] / diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
-                return FailedCheck(message, m, factor=way[m] / diameter / limits.move)
+            part = f"{way.max() / self._diameter:.3g} of the smallest diameter (watch.move = {limits.move:g})"
+            found.append((way / self._diameter, limits.move, f"{{}} moves {way.max():.3g} Å {between}, {part}"))
         if limits.turn_rad and len(state.rotation):
             omega = state.angular_momentum_body * self._per_momentum[model.species]
             angle = stride * np.sqrt((omega**2).sum(axis=1)) * load.torque_body.any(axis=1)
-            m = int(angle.argmax())
-            if angle[m] > limits.turn_rad:
-                message = f"{molecule_label(system, m)} rotates by {angle[m]:.3g} rad between two force evaluations"
-                message += f" (watch.turn_rad = {limits.turn_rad:g})"
-                return FailedCheck(message, m, factor=angle[m] / limits.turn_rad)
+            message = f"{{}} rotates by {angle.max():.3g} rad {between} (watch.turn_rad = {limits.turn_rad:g})"
+            found.append((angle, limits.turn_rad, message))
+        for size, limit, message in found:
+            if size.max() > limit:
+                m = int(size.argmax())
+                return FailedCheck(message.format(molecule_label(system, m)), m, factor=size[m] / limit)
         return None
 
     def _is_within_limits(self, largest: LargestValues, scheme: Scheme, dt: float) -> bool:
@@ -166,9 +126,8 @@ class StepCheck:
                 return False
         if limits.move and not sqrt(3) * stride * largest.velocity <= limits.move * self._diameter:
             return False
-        if not limits.turn_rad:
-            return True
-        return sqrt(3) * stride * largest.angular_momentum * self._most_per_momentum <= limits.turn_rad
+        angle = sqrt(3) * stride * largest.angular_momentum * self._most_per_momentum
+        return not limits.turn_rad or angle <= limits.turn_rad
 
 
 def axis_distances(molecule: Molecule) -> np.ndarray:
@@ -183,23 +142,21 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
     The change is compared with the earlier kinetic energy plus the potential energy released since, or with the kinetic
     energy at a thermostat's temperature if that is larger. In a minimisation only Q is checked.
     """
+    stage, fraction = system.scene.stages[now.stage], 1.0
     if limits.orthogonality and not now.orthogonality_error <= limits.orthogonality:
         message = f"|QᵀQ - 1| is {now.orthogonality_error:.2g} (watch.orthogonality = {limits.orthogonality:g})"
         return FailedCheck(f"a matrix Q is not a rotation: {message}", rotation_not_orthogonal=True)
-    if system.scene.stages[now.stage].is_minimisation:
+    if stage.is_minimisation:
         return None
-    grown = now.volume * 1e3 / system.state.volume if system.scene.stages[now.stage].has_barostat else 1.0
+    grown = now.volume * 1e3 / system.state.volume if stage.has_barostat else 1.0
     if limits.volume and grown > limits.volume:
         message = f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {limits.volume:g})"
         return FailedCheck(f"{message}, {now.density:.3g} g/cm³", evaporated=True)
     if not limits.energy:
         return None
-    stage, fraction = system.scene.stages[now.stage], 1.0
-    kinetic = since.kinetic
+    kinetic, per_kelvin = since.kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL
     if stage.has_thermostat:
-        kinetic = max(
-            kinetic, 0.5 * BOLTZMANN / KJ_PER_MOL * max(stage.temperatures) * system.freedom_in(now.stage).total
-        )
+        kinetic = max(kinetic, per_kelvin * max(stage.temperatures) * system.freedom_in(now.stage).total)
         fraction = min(1.0, stage.thermostat_time / (now.time - since.time)) if now.time > since.time else 1.0
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
@@ -261,12 +218,12 @@ def _first_overlap(
     """Time and sites of the first overlap of this molecule, or else of any."""
     first: tuple[str, OverlappingPair | None] = ("", None)
     for where, state in states:
-        if all(np.isfinite(array).all() for array in state):
-            pair = most_overlapping_pair(system, state, molecule)
-            if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
-                return where, pair
-            if first[1] is None:
-                first = where, pair
+        if not all(np.isfinite(array).all() for array in state):
+            continue
+        pair = most_overlapping_pair(system, state, molecule)
+        if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
+            return where, pair
+        first = first if first[1] else (where, pair)
     return first
 
 
@@ -278,8 +235,7 @@ def explain(
     states : to search for overlaps, each with a phrase for its time; dt, stable : step and longest stable step, ps
     """
     if isinstance(error, NotFiniteError):
-        message = f"{molecule_label(system, error.molecule)} is lost: {error.reason}"
-        failed = FailedCheck(message, error.molecule)
+        failed = FailedCheck(f"{molecule_label(system, error.molecule)} is lost: {error.reason}", error.molecule)
     elif isinstance(error, BehindWallError):
         failed = FailedCheck(f"{molecule_label(system, error.molecule)} {error.reason}", error.molecule)
     elif isinstance(error, FailedCheck):
@@ -292,11 +248,11 @@ def explain(
         a, b = site_labels(system, pair)
         whose = "the smallest" if pair.without_repulsion else "their"
         text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.fraction:.2g} of {whose} diameter"
-    likely, advice = _cause(system, failed, pair, dt, stable)
-    return f"{text}. Likely cause: {likely}. Try {advice}"
+    return f"{text}. Likely cause: {_cause(system, failed, pair, dt, stable)}"
 
 
-def _cause(system: System, failed: FailedCheck, pair: OverlappingPair | None, dt: float, stable: float | None) -> Cause:
+def _cause(system: System, failed: FailedCheck, pair: OverlappingPair | None, dt: float, stable: float | None) -> str:
+    """The likely cause of a failed check, and what to try."""
     shorter = f"a shorter timestep_fs than {dt / FEMTOSECOND:g}"
     if stable is not None and stable < dt:
         shorter = f"timestep_fs below {stable / FEMTOSECOND:.2g}, where the stiffest motion is stable"
@@ -304,114 +260,37 @@ def _cause(system: System, failed: FailedCheck, pair: OverlappingPair | None, dt
         shorter = f"timestep_fs = {dt / failed.factor / FEMTOSECOND:.2g} or less"
     if pair is not None and pair.without_repulsion:
         a, b = system.sites.name[[pair.first, pair.second]]
-        return Cause(
-            "a charge on a site without repulsion has collapsed onto an opposite one",
-            f"giving one of these sites sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites = "
-            f'["{a}", "{b}"]',
+        return (
+            "a charge on a site without repulsion has collapsed onto an opposite one. Try giving one of these sites "
+            f'sigma_A and epsilon_kJ_mol, or the pair an entry [[forces.pairs]] with sites = ["{a}", "{b}"]'
         )
     if pair is not None:
-        return Cause(
-            "these sites overlap: from the start, or because a step was too long",
-            f"a start without overlaps, an nvt stage with a short step first, or {shorter}",
+        return (
+            "these sites overlap: from the start, or because a step was too long. Try a start without overlaps, an nvt "
+            f"stage with a short step first, or {shorter}"
         )
     if failed.molecule is not None:
         species = system.species[system.model.species[failed.molecule]]
         even = species.mass * axis_distances(species) ** 2
         fraction = np.divide(species.inertia, even, out=np.ones(3), where=species.inertia > 0)
         if fraction.min() < MIN_INERTIA_FRACTION:
-            return Cause(
+            return (
                 f"bad inertia: a moment of {species.name} is {species.inertia[fraction.argmin()]:.2g} u Å², "
-                f"{fraction.min():.1g} of that of its mass at the outermost site, so torques rotate it too fast",
-                f"more of its mass on the outer sites, or {shorter}",
+                f"{fraction.min():.1g} of that of its mass at the outermost site, so torques rotate it too fast. Try "
+                f"more of its mass on the outer sites, or {shorter}"
             )
     if failed.evaporated:
-        return Cause(
-            "at this temperature and pressure the liquid boils, or it starts far from its density under great pressure",
-            "a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or watch.volume = false "
-            "for a gas",
+        return (
+            "at this temperature and pressure the liquid boils, or it starts far from its density under great "
+            "pressure. Try a higher pressure_bar or a lower temperature_K, an nvt stage before the barostat, or "
+            "watch.volume = false for a gas"
         )
     if failed.rotation_not_orthogonal:
-        return Cause(
-            "Q was not a rotation at the start or was changed from outside: a run only multiplies rotations",
-            "the start from which the last good state came; a very long run may raise watch.orthogonality",
+        return (
+            "Q was not a rotation at the start or was changed from outside: a run only multiplies rotations. Try the "
+            "start from which the last good state came; a very long run may raise watch.orthogonality"
         )
-    return Cause("timestep_fs is too long for this motion", f"{shorter}, or an nvt stage first")
-
-
-class BodyCheck:
-    """Checks of the run of a body, relative to `exchanged`, the largest energy exchanged so far (J)."""
-
-    def __init__(self, system: BodySystem, limits: BodyWatch):
-        self.system = system
-        self.limits = limits
-        self._start = self._energies(system.state)
-        weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
-        swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
-        self.exchanged = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * swing)
-
-    def _energies(self, state: State) -> dict[str, float]:
-        columns = energies(self.system, state.time[:1], State(*(array[None] for array in state)))
-        return {name: float(values[0]) for name, values in columns.items()}
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def failed_check(self, state: State, dt: float) -> FailedCheck | None:
-        """The failed check of a state of the run, if there is one."""
-        system, limits = self.system, self.limits
-        largest = not_none(limits.orthogonality)
-        if largest and not (worst := orthogonality_error(state.rotation)) <= largest:
-            message = f"Q is not a rotation: |QᵀQ - 1| is {worst:.2g} (watch.orthogonality = {largest:g})"
-            return FailedCheck(message, rotation_not_orthogonal=True)
-        if system.rotates and limits.turn_rad:
-            omega = system.pose(float(state.time[0]), state).angular_velocity_body
-            angle = dt * float(np.linalg.norm(omega))
-            if angle > limits.turn_rad:
-                message = f"the body rotates by {angle:.3g} rad in a step (watch.turn_rad = {limits.turn_rad:g})"
-                return FailedCheck(message, factor=angle / limits.turn_rad)
-        if not limits.energy or not is_balanced(system):
-            return None
-        start, now = self._start, self._energies(state)
-        self.exchanged = max(self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
-        error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
-        scale = self.exchanged + ROUNDING * abs(now["energy"])
-        if error <= limits.energy * scale:
-            return None
-        return FailedCheck(
-            f"the energy less the work done changed by {error:.3g} J, {error / scale if scale else inf:.3g} of all "
-            f"energy exchanged (watch.energy = {limits.energy:g})"
-        )
-
-    def explain(self, error: SimulationError, dt: float, stable: float | None) -> str:
-        """The message of a failed check in full: what was observed, the likely cause, what to try."""
-        system = self.system
-        if isinstance(error, NotFiniteError):
-            failed = FailedCheck("position or momentum of the body is not finite")
-        elif isinstance(error, FailedCheck):
-            failed = error
-        else:
-            return str(error)
-        shorter = f"a shorter timestep_s than {dt:g}"
-        if stable is not None and stable < dt:
-            shorter = f"timestep_s below {stable:.2g}, where its spin and swing are stable"
-        elif failed.factor is not None:
-            shorter = f"timestep_s = {dt / failed.factor:.2g} or less"
-        inertia = system.inertia
-        if failed.rotation_not_orthogonal:
-            cause = Cause(
-                f"only accuracy keeps Q a rotation under {system.method.name}"
-                if isinstance(system.method, Solver)
-                else "Q was changed from outside: a run only multiplies rotations",
-                f"integrator = 'srkn_6', which keeps Q, or {shorter}",
-            )
-        elif system.rotates and inertia[inertia > 0].min() < MIN_INERTIA_FRACTION * inertia.max():
-            least = inertia[inertia > 0].min()
-            cause = Cause(
-                f"bad inertia: the smallest moment, {least:.2g} kg m², is {least / inertia.max():.1g} of the largest, "
-                "and the body spins about that axis faster than the step can follow",
-                f"{shorter}, or a moment of 0",
-            )
-        else:
-            cause = Cause("timestep_s is too long for this motion, or a force grows without bound", shorter)
-        return f"{failed}. Likely cause: {cause.likely}. Try {cause.advice}"
+    return f"timestep_fs is too long for this motion. Try {shorter}, or an nvt stage first"
 
 
 def kicks(model: Model, load: Load, thermal: float, dt: float) -> np.ndarray:

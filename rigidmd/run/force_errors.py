@@ -1,13 +1,17 @@
-"""Errors of the forces of a scene: of Ewald sums, estimated and measured, and of single precision between pairs."""
+"""Errors of the forces of a scene: of Ewald sums, estimated and measured; of single precision between pairs; of
+user-defined forces, which are compared with their energies."""
 
-from math import pi, sqrt
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import inf, pi, sqrt
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from scipy.special import erf
 
 from rigidmd.assemble.build import build
-from rigidmd.core.state import State
+from rigidmd.core.state import Load, State
+from rigidmd.dynamics.barostats import COMPONENTS
 from rigidmd.dynamics.momenta import mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
@@ -16,58 +20,44 @@ from rigidmd.forces.ewald.errors import charges_of, k_cutoff_of_count, k_space_e
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
-from rigidmd.units import COULOMB
+from rigidmd.mechanics.rotation import from_vector
+from rigidmd.units import COULOMB, KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.forces.ewald.pme import Pme  # needs rocket-fft, which is for scenes with PME
+
 
 #: Error of the reference sum, relative to the estimated error of the sum under test.
 REFERENCE_ERROR = 1e-3
 MIN_REFERENCE_ERROR = 1e-12  # e²/Å²; float64 has no more digits
 
 
-class CoulombErrors(NamedTuple):
-    """Errors of the Coulomb forces on sites, u Å/ps², and of the Coulomb energy."""
-
-    estimated: float  # rms
-    measured: float  # rms
-    largest: float
-    force: float  # rms of the forces themselves
-    energy: float  # u Å²/ps²
-    reference: str  # the sum compared with
-
-    @property
-    def relative(self) -> float:
-        return self.measured / self.force
-
-
-def coulomb_errors(system: System, state: State) -> CoulombErrors:
-    """Errors of a system's Ewald sums at a state. Raises SceneError if it has none."""
+def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str, Any]:
+    """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared with a more accurate
+    sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of `size` u Å²/ps². Raises SceneError if it
+    has no Ewald sums."""
     scene = system.scene
     if system.force_error is None:
         method = scene.forces.electrostatics
         raise SceneError(
             scene.source, [f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"]
         )
-    forces = scene.forces.model_copy(
-        update={
-            "electrostatics": "ewald",
-            "ewald_accuracy": max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR),
-            **dict.fromkeys(("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")),
-            **dict.fromkeys(("pme_order", "pme_grid")),
-        }
-    )
-    tight = scene.model_copy(update={"forces": forces, "precision": "double"})
-    reference = build(tight)
+    accuracy = max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR)
+    settings = ("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A", "pme_order", "pme_grid")
+    changes = dict.fromkeys(settings) | {"electrostatics": "ewald", "ewald_accuracy": accuracy}
+    forces = scene.forces.model_copy(update=changes)
+    reference = build(scene.model_copy(update={"forces": forces, "precision": "double"}))
     moves = mobile(system.model)[cast(PairForces, system.terms["coulomb_real"]).sites.molecule]
     found, energy = _coulomb(system, state)
     exact, exact_energy = _coulomb(reference, state)
     error = np.linalg.norm((found - exact)[moves], axis=1)
-    return CoulombErrors(
-        estimated=system.force_error, measured=float(np.sqrt((error**2).mean())), largest=float(error.max()),
-        force=float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean())), energy=energy - exact_energy,
-        reference=next(note for note in reference.notes if note.startswith("ewald")),
-    )  # fmt: skip
+    measured, force = float(np.sqrt((error**2).mean())), float(np.sqrt((exact[moves] ** 2).sum(axis=1).mean()))
+    return {
+        "reference": next(note for note in reference.notes if note.startswith("ewald")),
+        "rms_force_per_A": force / size, "rms_error_per_A": measured / size, "relative": measured / force,
+        "in_e2_per_A2": measured / COULOMB, "estimated_per_A": system.force_error / size,
+        "largest_error_per_A": float(error.max()) / size, "energy_error": (energy - exact_energy) / size,
+    }  # fmt: skip
 
 
 def estimated_error(system: System, cell: np.ndarray) -> float:
@@ -93,11 +83,9 @@ def single_precision_errors(system: System, state: State) -> tuple[float, float]
         return None
     exact = system.engine_of(system.terms, "double").evaluate(state)[0]
     found = system.engine().evaluate(state)[0]
-    errors = []
-    for a, b in zip(found, exact, strict=True):
-        size = float(np.linalg.norm(b))
-        errors.append(float(np.linalg.norm(a - b)) / size if size > 0 else 0.0)
-    return errors[0], errors[1]
+    sizes = [(float(np.linalg.norm(a - b)), float(np.linalg.norm(b))) for a, b in zip(found, exact, strict=True)]
+    force, torque = (error / size if size > 0 else 0.0 for error, size in sizes)
+    return force, torque
 
 
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
@@ -129,3 +117,108 @@ def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, a
         np.subtract.at(force, i, pull)
         np.add.at(force, i + gap, pull)
     return force
+
+
+#: Displacements of molecules, in smallest diameters or radians, and strains of the box. A force is right if it agrees
+#: for one of them, as a pair that crosses a cutoff at which the energy jumps spoils a difference.
+STEP_FRACTIONS, STRAINS = (1e-4, 1e-5), (1e-5, 1e-6, 1e-7)
+#: Allowed error of a difference, as a fraction of the largest force, torque or virial of the term.
+TOLERANCE = 1e-4
+#: Rounding error of an energy, as a fraction of its size.
+ROUNDING = 1e-13
+
+
+#: The fall of the energy along a move, if it is not the given one: by a function of the step, steps, given value, size.
+_Difference = Callable[[Callable[[float], State], Sequence[float], float, float], float | None]
+
+
+def check_forces(system: System, state: State) -> None:
+    """Compare user-defined forces with differences of their energies, for a few molecules and the box. Raises
+    SceneError with the numbers where they differ."""
+    if errors := [error for name in system.user_terms if (error := _error_of_force(system, state, name))]:
+        raise SceneError(system.scene.source, errors)
+
+
+def _error_of_force(system: System, state: State, name: str) -> str:
+    engine = system.engine_of({name: system.terms[name]}, "double")
+    load, tallies = engine.evaluate(state)
+    tally = tallies[name]
+    if not np.isfinite(tally.energy):
+        return f"{name}: its energy at the start is {tally.energy}"
+    noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
+
+    def difference(moved: Callable[[float], State], steps: Sequence[float], given: float, size: float) -> float | None:
+        found = []
+        for step in steps:
+            ahead, behind = (engine.evaluate(moved(way))[1][name].energy for way in (step, -step))
+            found.append((behind - ahead) / (2 * step))
+            if abs(found[-1] - given) <= TOLERANCE * max(size, abs(found[-1])) + noise / step:
+                return None
+        return found[0]
+
+    wrong = _check_molecules(system, state, load, difference)
+    if not wrong and state.volume < inf and name not in system.position_dependent:
+        wrong = _check_virial(state, tally.virial, max(float(np.abs(tally.virial).sum()), noise), difference)
+    return f"{name}: {wrong}" if wrong else ""
+
+
+def _check_molecules(system: System, state: State, load: Load, difference: _Difference) -> str:
+    """The error of a force or torque, on the molecules with the two largest and a median one; empty without one."""
+    rng = np.random.default_rng(0)
+    species = [system.species[k] for k in system.model.species]
+    for kind, acting, unit in (("force", load.force, "kJ/mol/Å"), ("torque", load.torque_body, "kJ/mol")):
+        size = np.linalg.norm(acting, axis=1)
+        ranked = np.argsort(size, kind="stable")
+        for m in dict.fromkeys(ranked[[-1, -min(2, len(ranked)), len(ranked) // 2]].tolist() if len(ranked) else ()):
+            if kind == "torque" and not species[m].radius:
+                continue
+            along = rng.standard_normal(3) + (acting[m] / size[m] if size[m] else 0.0)
+            if kind == "torque":
+                along *= species[m].inertia > 0
+            if not along.any():
+                continue
+            along /= np.linalg.norm(along)
+            given = float(acting[m] @ along)
+            steps = [fraction * (system.smallest_diameter if kind == "force" else 1.0) for fraction in STEP_FRACTIONS]
+            found = difference(partial(_moved, state, kind, m, along), steps, given, size.max())
+            if found is not None:
+                where = "the lab's axes" if kind == "force" else "the axes of its body"
+                return (
+                    f"the {kind} on molecule {m + 1} ({species[m].name}) is not the derivative of the energy: along "
+                    f"({', '.join(f'{x:.3f}' for x in along)}) in {where} it is {given / KJ_PER_MOL:.8g} {unit}, and "
+                    f"the energy falls by {found / KJ_PER_MOL:.8g} {unit}"
+                )
+    return ""
+
+
+def _moved(state: State, kind: str, m: int, along: np.ndarray, by: float) -> State:
+    """A copy of a state with a molecule moved (Å, lab) or rotated (rad, body axes)."""
+    moved = state.copy()
+    if kind == "force":
+        moved.position[m] += by * along
+    else:
+        moved.rotation[m] = moved.rotation[m] @ from_vector(by * along)
+    return moved
+
+
+def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Difference) -> str:
+    """The error of the virial in a box; empty without one."""
+    for i, j in COMPONENTS:
+        given = float(virial[j, i])
+        found = difference(partial(_strained, state, i, j), STRAINS, given, size)
+        if found is not None:
+            return (
+                f"the component {'xyz'[j]}{'xyz'[i]} of its molecular virial is {given / KJ_PER_MOL:.8g} kJ/mol, and "
+                f"when box and centres of mass are strained the energy falls by {found / KJ_PER_MOL:.8g} kJ/mol: "
+                f"{'correct it' if virial.any() else 'add it'}, or, if the energy depends on positions in the lab, set "
+                "tied_to_places = True in its class"
+            )
+    return ""
+
+
+def _strained(state: State, i: int, j: int, by: float) -> State:
+    """A copy of a state with centres of mass and cell strained, x_j += by x_i (lab)."""
+    strained = state.copy()
+    for array in (strained.position, strained.cell):
+        array[:, j] += by * array[:, i]
+    return strained

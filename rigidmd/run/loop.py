@@ -18,27 +18,15 @@ from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
 from rigidmd.engines.protocol import Halted, NotFiniteError
 from rigidmd.errors import OutputError, RigidMDError, SimulationError
+from rigidmd.io import folder as run_folder
 from rigidmd.io.checkpoint import Checkpoint, latest
-from rigidmd.io.folder import (
-    CHECKPOINT,
-    PREVIOUS,
-    SUMMARY,
-    FolderLock,
-    check_folder,
-    check_names,
-    continue_folder,
-    is_empty,
-    make_folder,
-    never_began,
-)
+from rigidmd.io.folder import CHECKPOINT, PREVIOUS, SUMMARY, FolderLock
 from rigidmd.io.progress import progress_of
-from rigidmd.run.checkpoints import SEGMENT_SECONDS, CheckpointSchedule
+from rigidmd.io.write import write_json
+from rigidmd.run import resume
 from rigidmd.run.observers import Moment, Observer
-from rigidmd.run.provenance import computed_with, input_digests, plain, provenance
-from rigidmd.run.report import write_summary
 from rigidmd.run.results import Results
-from rigidmd.run.resume import as_checkpoint_errors, describe_changes, restored, stored
-from rigidmd.run.segments import ObservationSchedule, RunTimes
+from rigidmd.run.schedule import SEGMENT_SECONDS, CheckpointSchedule, ObservationSchedule
 from rigidmd.run.signals import interruptible, signal_handler, stop_signals
 
 if TYPE_CHECKING:
@@ -68,12 +56,9 @@ class RunLoop:
     results : of the run, after its end
     """
 
-    def __init__(
-        self, simulation: "Simulation", observers: Sequence[Observer], force: bool, resume: bool, deadline: float | None
-    ):
-        self._simulation, self._folder = simulation, simulation.folder
-        self._part = simulation.part
-        self._user_observers, self._force, self._resume = observers, force, resume
+    def __init__(self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None):
+        self._simulation, self._folder, self._part = simulation, simulation.folder, simulation.part
+        self._force, self._resumes = force, resumes
         minutes = simulation.scene.output.checkpoint_minutes
         self.checkpoints = CheckpointSchedule(simulation.folder, minutes, deadline)
         self.process = os.getpid()
@@ -135,29 +120,29 @@ class RunLoop:
                 lock = FolderLock(self._folder)
                 stack.callback(self._if_not_forked, lock.release)
                 lock.take()
-                if self._resume:
+                if self._resumes:
                     kept, stays = self._read_checkpoint(self._folder)
             part.reset()
-            began, input_sha256 = clock.perf_counter(), input_digests(simulation.scene)
-            scene, changed = plain(simulation.scene), None
+            began, input_sha256 = clock.perf_counter(), resume.input_digests(simulation.scene)
+            scene, changed = resume.plain(simulation.scene), None
             if kept is not None:
-                with as_checkpoint_errors(self._folder):
+                with resume.as_checkpoint_errors(self._folder):
                     kind = part.record_type
-                    part.record = kind(**restored(kept.of(RECORD), kind.types(), part.scene.rows))
+                    part.record = kind(**resume.restored(kept.of(RECORD), kind.types(), part.scene.rows))
                     part.restore(kept)
                     part.check_position()
-                    changed = describe_changes(kept.values["with"])
+                    changed = resume.describe_changes(kept.values["with"])
             part.record.scene, part.record.inputs = scene, input_sha256
-            self._observers = _observers_by_name(part.default_observers(), self._user_observers)
+            self._observers = _observers_by_name(part.default_observers(), simulation.observers)
             observers = list(self._observers.values())
             names = [name for observer in observers for name in observer.files()]
             names += [SUMMARY, *([CHECKPOINT, PREVIOUS] if self.checkpoints.writes else [])]
             if self._folder is not None and stays:
-                check_names(self._folder, names)
+                run_folder.check_names(self._folder, names)
             elif self._folder is not None:
                 source = Path(simulation.scene.source)
                 inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
-                check_folder(self._folder, self._force, inputs, names)
+                run_folder.check_folder(self._folder, self._force, inputs, names)
             if kept is None:
                 with interruptible(), PROCESS_LOCK:  # of several runs one compiles, and the others read its cache
                     part.prepare()
@@ -165,7 +150,7 @@ class RunLoop:
             for observer in observers:
                 stack.push(partial(self._close, observer))
             if kept is not None:  # all checks come before the first change of a file
-                with as_checkpoint_errors(self._folder):
+                with resume.as_checkpoint_errors(self._folder):
                     for name, observer in self._observers.items():
                         if name.startswith(USER) and name not in kept.values["of"]:
                             observer.begin(simulation)
@@ -175,9 +160,9 @@ class RunLoop:
                     simulation.note(changed)
                 simulation.announce(f"continuing from step {part.state.step[NOW]}")
             if self._folder is not None and stays:
-                continue_folder(self._folder, names)
+                run_folder.continue_folder(self._folder, names)
             elif self._folder is not None:
-                make_folder(self._folder, names, lock)
+                run_folder.make_folder(self._folder, names, lock)
             yield
             for observer in observers:
                 if kept is None:
@@ -189,7 +174,7 @@ class RunLoop:
                 while self._until < inf and self.signal is None and self._error is None:
                     yield  # `run` or `close` completes the run
                 wall = self._wall + clock.perf_counter() - self._since
-                self._finish(RunTimes(preparing, wall, part.record.position.computing))
+                self._finish(preparing, wall)
             except (SimulationError, OutputError) as error:
                 self._check_process()
                 raise self._failed(error) from None
@@ -214,24 +199,23 @@ class RunLoop:
         if os.getpid() != self.process:
             raise OutputError("a forked process cannot continue the run: the files belong to the process that began it")
 
-    def _finish(self, times: RunTimes) -> None:
-        """Make the results, with all files written. Raises OutputError."""
+    def _finish(self, preparing: float, wall: float) -> None:
+        """Make the results, with all files written; times as in `RunPart.summary`. Raises OutputError."""
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
         results = Results(part.system, part.state, part.samples())
         results.interrupted, results.signal, results.out_of_time = self.interrupted, self.signal, self.out_of_time
-        made_by = provenance(simulation.scene, part.threads, part.record.inputs, part.engine_version)
-        results.summary = made_by | part.summary(results.samples, times)
-        noted = len(notes)
+        made_by = resume.provenance(simulation.scene, part.threads, part.record.inputs, part.engine_version)
+        results.summary = made_by | part.summary(results.samples, preparing, wall)
         for draws in (False, True):  # results first, pictures after
+            noted = len(notes)
             for observer in self._observers.values():
                 if observer.draws == draws:
                     self._call_observer(observer, observer.end, simulation, results)
             files = [*results.files, *([] if self._folder is None else [self._folder / SUMMARY])]
             results.summary["notes"] += notes[noted:]
-            noted = len(notes)
             if self._folder is not None:
                 results.summary["files"] = [str(path) for path in files]
-                write_summary(self._folder / SUMMARY, results.summary)
+                write_json(files[-1], results.summary, indent=2, ensure_ascii=False, allow_nan=False)
         results.files, self.results = files, results
         if self._error is not None:
             raise self._error
@@ -244,17 +228,18 @@ class RunLoop:
         step = int(part.state.step[ORIGIN]) + round((time - origin) / part.segment.dt)
         where = f"stopped at step {step} ({time:g} {part.time_unit}): "
         if isinstance(error, OutputError):
-            advice = f". Free disk space and resume from the last checkpoint: rigidmd resume {self._folder}"
-            kept = [] if self._folder is None else [self._folder / CHECKPOINT, self._folder / PREVIOUS]
-            return OutputError(f"{where}{error}{advice if any(path.is_file() for path in kept) else ''}")
+            advice = ""
+            if self._folder is not None and any((self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS)):
+                advice = f". Free disk space and resume from the last checkpoint: rigidmd resume {self._folder}"
+            return OutputError(f"{where}{error}{advice}")
         saved = "".join(observer.failed(self._simulation) for observer in self._observers.values())
         return SimulationError(f"{where}{part.explain(error)}{saved}")
 
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
         """The checkpoint to resume from, None if the run has to begin, and whether the files of the folder stay."""
-        if is_empty(folder) or never_began(folder):
+        if run_folder.is_empty(folder) or run_folder.never_began(folder):
             self._simulation.announce(f"{folder} holds no run yet: beginning it")
-            return None, not is_empty(folder)
+            return None, not run_folder.is_empty(folder)
         kept, problems = latest(folder)
         for problem in problems:
             self._simulation.warn(f"{problem}. The checkpoint before it is used")
@@ -267,11 +252,11 @@ class RunLoop:
             return  # after an error a run that resumes calls the observer again
         parts = {name: observer.memory() for name, observer in self._observers.items()}
         parts |= {
-            RECORD: stored(record, record.types()), "engine": Checkpoint({}, memory),
+            RECORD: resume.stored(record, record.types()), "engine": Checkpoint({}, memory),
             "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),
         }  # fmt: skip
         arrays = {f"{owner}/{name}": array for owner, kept in parts.items() for name, array in kept.arrays.items()}
-        data = {"with": computed_with(), "of": {owner: kept.values for owner, kept in parts.items()}}
+        data = {"with": resume.computed_with(), "of": {owner: kept.values for owner, kept in parts.items()}}
         position = record.position.segment, int(part.state.step[NOW]), record.position.seconds > 0
         self.checkpoints.write_once(Checkpoint(data, arrays), position)
 
@@ -285,7 +270,7 @@ class RunLoop:
                 part.segment = segment = part.enter_segment(k)
                 position.segment, position.first, position.seconds = k, int(part.state.step[NOW]), 0.0
                 if k == 0:
-                    self._notify(self._moment(0), [observer.interval is not None for observer in observers])
+                    self._notify(0, [observer.interval is not None for observer in observers])
                     self._checkpoint()
             done, resumed = int(part.state.step[NOW]) - position.first, False
             schedule = ObservationSchedule(observers, segment)
@@ -294,7 +279,7 @@ class RunLoop:
                 segment.action(self._progress)
                 position.seconds = clock.perf_counter() - began
                 due = [observer.interval is not None or observer.ends for observer in observers]
-                self._notify(self._moment(0), due)
+                self._notify(0, due)
             shown, pace = None, inf
             self._bar.unpause()
             while done < segment.steps and not self.interrupted:
@@ -302,7 +287,7 @@ class RunLoop:
                 if pace > 0:
                     to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))  # the first step alone, as it may be slow
                 before, shown = shown, schedule.due(to)
-                with_energies = schedule.reads_energies(shown)
+                with_energies = any(each.reads_energies for each, now in zip(observers, shown, strict=True) if now)
                 began = clock.perf_counter()
                 try:
                     part.engine.advance(part.state, segment.method, segment.dt, position.first + to, with_energies)
@@ -315,7 +300,7 @@ class RunLoop:
                 if not part.is_finite():
                     raise NotFiniteError(part.state)
                 advance, done = segment.dt * (to - done), to
-                self._notify(self._moment(done), shown)
+                self._notify(done, shown)
                 self._bar.update(advance)
                 if not self.must_end() and done < segment.steps and self.checkpoints.is_due:
                     self._checkpoint()
@@ -325,19 +310,17 @@ class RunLoop:
                 self._checkpoint()
             if done < segment.steps and shown is not None:  # only a run that stops here calls these observers
                 due = [observer.ends and not seen for observer, seen in zip(observers, shown, strict=True)]
-                self._notify(self._moment(done), due)
+                self._notify(done, due)
             position.time += done * segment.dt
             position.computing.append(position.seconds)
             if self.interrupted:
                 break
 
-    def _moment(self, done: int) -> Moment:
-        """The moment after `done` steps of the present segment."""
+    def _notify(self, done: int, due: Sequence[bool]) -> None:
+        """Call the observers that are due after `done` steps of the present segment."""
         position = self._part.record.position
         time = position.time + done * self._part.segment.dt
-        return Moment(self._simulation, position.first + done, time, position.segment)
-
-    def _notify(self, moment: Moment, due: Sequence[bool]) -> None:
+        moment = Moment(self._simulation, position.first + done, time, position.segment)
         for observer, now in zip(self._observers.values(), due, strict=True):
             if now and not (observer.once and self._part.is_replaced(moment)):
                 self._call_observer(observer, observer.see, moment)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from math import isfinite, nan
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,8 @@ from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
 from rigidmd.dynamics.momenta import remove_momentum
-from rigidmd.dynamics.observables import LargestValues, largest_values
-from rigidmd.engines.observables import Observation, observe
+from rigidmd.dynamics.observables import largest_values
+from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.samples import COLUMNS, Samples
 from rigidmd.engines.system import System
@@ -27,29 +28,24 @@ from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
-from rigidmd.run.force_errors import coulomb_errors
-from rigidmd.run.minimise import minimise
+from rigidmd.run.force_errors import check_forces, coulomb_errors
+from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
-from rigidmd.run.overlap_removal import OverlapRemoval, remove_overlaps
 from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import is_estimate_cheap, stable_angle, stiffest_mode
-from rigidmd.run.provenance import plain
-from rigidmd.run.quantity_docs import describe_quantities
 from rigidmd.run.report import summary_text
-from rigidmd.run.resume import Count, RunRecord, check_same_scene, state_from
-from rigidmd.run.segments import RunTimes, Segment
+from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
+from rigidmd.run.schedule import Segment
 from rigidmd.run.signals import interruptible
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
-from rigidmd.run.user_force_check import check_forces
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
+from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 if TYPE_CHECKING:
     import ase
 
-    from rigidmd.engines.external import ExternalEngine
     from rigidmd.run.simulation import Simulation
 
 
@@ -105,12 +101,14 @@ class MolecularRun(RunPart):
         return atoms_of_system(self.system, self.state, self.scene.output.positions == "wrapped")
 
     def start(self) -> OverlapRemoval | None:
+        """Go to the state before the first step, from which a run starts. Returns the removal of overlaps."""
         self.reset()
         with interruptible():
             self._remove_overlaps()
         return self.record.removal
 
     def settle(self) -> State:
+        """Go to the state after removal of overlaps and the minimisations that come first, from which time passes."""
         self.start()
         for k, stage in enumerate(self.scene.stages):
             if not stage.is_minimisation:
@@ -130,22 +128,25 @@ class MolecularRun(RunPart):
         self.record.stages = tuple(stages)
         scene = self._start.scene.model_copy(update={"stages": self.record.stages})
         self.system = replace(self._start, scene=scene)
-        self._integrators: dict[int, Scheme] = {}
-
-    def _integrator(self, k: int) -> Scheme:
-        """The integrator of stage k with its thermostat and barostat, made once."""
-        if k not in self._integrators:
-            self._integrators[k] = integrator_of_stage(self.system, k)
-        return self._integrators[k]
+        # the integrator of a stage with its thermostat and barostat, made once
+        self._integrator = cache(partial(integrator_of_stage, self.system))
 
     def prepare(self) -> None:
         """Remove overlaps, and compile the steps, or compare the start with an external engine."""
         if self.scene.engine.is_external:
+            from rigidmd.engines.comparison import compare_at, describe_comparison
             from rigidmd.engines.external import external_engine
 
             other = external_engine(self.system)  # first: the error of a missing program comes before compilation
-            self._remove_overlaps()
-            self._check(other)
+            try:
+                self._remove_overlaps()
+                lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
+            finally:
+                other.close()
+            if not all(line.agrees for line in lines):
+                title = self.scene.engine.name
+                table = describe_comparison(lines, title)
+                raise EngineError(f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}")
         else:
             self._remove_overlaps()
             with user_errors_explained(self.system):
@@ -167,10 +168,8 @@ class MolecularRun(RunPart):
         deepest = max((m.epsilon.max() for m in system.species), default=0.0)
         thermal = BOLTZMANN * (scene.start.temperature_K or 0.0) or deepest
         if system.from_lattice and not first.is_minimisation and thermal > 0:
-            radius, dt = np.array([m.radius for m in system.species]), first.timestep_fs * FEMTOSECOND
-            removal = self.record.removal = remove_overlaps(
-                system.model, self.engine, self.state, radius, system.smallest_diameter, thermal, dt
-            )
+            dt = first.timestep_fs * FEMTOSECOND
+            removal = self.record.removal = remove_overlaps(system, self.engine, self.state, thermal, dt)
             if removal.excess > 1:
                 problem = (
                     f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after "
@@ -185,19 +184,6 @@ class MolecularRun(RunPart):
     def _state_for(self, method: Scheme | Solver) -> State:
         """The present state, without copies, with the additional variables of an integrator."""
         return self.state._replace(extra_variables=self.engine.variables(self.state, method))
-
-    def _check(self, other: "ExternalEngine") -> None:
-        """Compare energies and forces at the start with an external engine, and close it. Raises EngineError."""
-        from rigidmd.engines.comparison import compare_at, describe_comparison
-
-        try:
-            lines = compare_at(self.system, self.state, self.system.engine_of(self.system.terms, "double"), other)
-        finally:
-            other.close()
-        if not all(line.agrees for line in lines):
-            title = self.scene.engine.name
-            table = describe_comparison(lines, title)
-            raise EngineError(f"{self.scene.source}: {title} and rigidmd do not agree at the start\n{table}")
 
     def _engine_of(self, k: int) -> Engine:
         """The engine of stage k; minimisations are always by rigidmd."""
@@ -237,8 +223,7 @@ class MolecularRun(RunPart):
         self.engine.recall(self.state, kept.of("engine").arrays)
 
     def reenter_segment(self, k: int) -> Segment:
-        stage = self.scene.stages[k]
-        step = stage.timestep_fs * FEMTOSECOND
+        stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
             return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
         return Segment(self._integrator(k), step, stage.steps)
@@ -250,24 +235,22 @@ class MolecularRun(RunPart):
         record = self.record
         record.moves[record.position.segment] = self.engine.moves or (0, 0)
         record.position.segment = k
-        if (stage := self.scene.stages[k]).is_minimisation:
-            self.engine = self.system.engine()
-            self.state = self._state_for(stage.scheme)
-            self.state.begin_segment()
-            return self.reenter_segment(k)
-        if was_auto := stage.is_auto:
+        was_auto, moves = self.scene.stages[k].is_auto, not self.scene.stages[k].is_minimisation
+        if was_auto:
             self._choose(k)
-        self._estimate(k)
+        if moves:
+            self._estimate(k)
         # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene repeats the run to the
         # bit. The lists of the start, if nothing has moved since, are what new ones would be.
-        if k or was_auto or self.scene.engine.is_external or (record.removal and record.removal.steps):
+        as_at_start = k == 0 and moves and not was_auto and not self.scene.engine.is_external
+        if not as_at_start or (record.removal and record.removal.steps):
             self.engine = self._engine_of(k)
         segment = self.reenter_segment(k)
         self.state = self._state_for(segment.method)
         self.state.begin_segment()
         before = [other for other in range(k) if not self.scene.stages[other].is_minimisation]
         keeps = self.system.keeps_momentum_in
-        if before and keeps(k) and not keeps(before[-1]):
+        if moves and before and keeps(k) and not keeps(before[-1]):
             self.state.energy_ledger[REMOVED] -= remove_momentum(self.system.model, self.state.velocity)
         return segment
 
@@ -327,13 +310,8 @@ class MolecularRun(RunPart):
         return ended and not ends_here and k + 1 < len(stages) and stages[k + 1].is_minimisation
 
     def is_finite(self) -> bool:
-        state, extent = self.state, self.extent or largest_values(self.state)
+        state, extent = self.state, self.engine.extent(self.state) or largest_values(self.state)
         return all(map(isfinite, [*extent[:4], *state.energy_ledger.tolist(), *state.extra_variables.tolist()]))
-
-    @property
-    def extent(self) -> LargestValues | None:
-        """Largest values in the state and its load, if they are known from the last step."""
-        return self.engine.extent(self.state)
 
     def observe(self, moment: Moment) -> Observation:
         """The observation at a moment. The drift of its stage is counted from the last sample before the stage."""
@@ -348,17 +326,14 @@ class MolecularRun(RunPart):
         )  # fmt: skip
 
     def default_observers(self) -> list[Observer]:
-        output = self.scene.output
-        interval = output.log_interval_ps
+        output, interval = self.scene.output, self.scene.output.log_interval_ps
         check = checks.StepCheck(self.system, self.scene.watch)
         self._sampler = Sampler(self.simulation, interval, check)
-        observers: list[Observer] = [self._sampler]
-        if not self.scene.engine.is_external:  # external engines check their steps themselves
-            observers.append(StepWatch(self.simulation, check))
+        # external engines check their steps themselves
+        watch = [] if self.scene.engine.is_external else [StepWatch(self.simulation, check)]
         files: list[Observer] = []
         if output.trajectory:
-            velocities = bool(output.velocities)
-            wrapped = output.positions == "wrapped"
+            velocities, wrapped = bool(output.velocities), output.positions == "wrapped"
             files = [Frames(output.trajectory_interval_ps, output.topology, output.trajectory, velocities, wrapped)]
         if output.pressure_tensor_interval_ps:
             files.append(PressureTensor(output.pressure_tensor_interval_ps))
@@ -366,18 +341,15 @@ class MolecularRun(RunPart):
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
             files += [EnergyFigure()] if output.figures else []
-        return [*files, *observers]
+        return [*files, self._sampler, *watch]
 
     def samples(self) -> Samples:
         return self._sampler.samples
 
-    def summary(self, samples: Samples, times: RunTimes) -> dict[str, Any]:
-        record, interrupted = self.record, self.simulation.is_interrupted
-        record.moves[record.position.segment] = self.engine.moves or (0, 0)
-        return summarise(
-            self.system, samples, self.state, record.removal.steps if record.removal else 0, times, interrupted,
-            record.choices, record.stable, record.moves, record.minima, list(record.notes),
-        )  # fmt: skip
+    def summary(self, samples: Samples, preparing: float, wall: float) -> dict[str, Any]:
+        self.record.moves[self.record.position.segment] = self.engine.moves or (0, 0)
+        interrupted = self.simulation.is_interrupted
+        return summarise(self.system, self.record, samples, self.state, preparing, wall, interrupted)
 
     def explain(self, error: SimulationError) -> str:
         stable = self.record.stable.get(self.record.position.segment)
@@ -389,16 +361,17 @@ class MolecularRun(RunPart):
         yield "", self.state
         if (good := self._sampler.last_good) is None:
             return
-        yield f"at step {good.step}, ", good.state
-        steps, system, method = int(self.state.step[NOW]) - good.step, self.system, self.segment.method
+        first, system, method = int(good.step[NOW]), self.system, self.segment.method
+        yield f"at step {first}, ", good
+        steps = int(self.state.step[NOW]) - first
         short = 0 < steps * len(system.model.species) <= REPLAYED * checks.MOVES_PER_CHECK
         if short and self.engine.is_repeatable and not (self.segment.action or system.python_forces):
-            state = good.state.copy()
+            state = good.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
                 state = self.engine.begin(state, method)
                 state.begin_segment()
             self.engine.forget()
-            for to in sorted({good.step + steps * k // REPLAYED for k in range(1, REPLAYED)} - {good.step}):
+            for to in sorted({first + steps * k // REPLAYED for k in range(1, REPLAYED)} - {first}):
                 try:
                     self.engine.advance(state, method, self.segment.dt, to)
                 except SimulationError:
@@ -434,11 +407,5 @@ class MolecularRun(RunPart):
             "meaning": describe_quantities(self.system),
         }  # fmt: skip
         if measure_accuracy:
-            error = coulomb_errors(self.system, self.state)
-            found["accuracy"] = {
-                "reference": error.reference, "rms_force_per_A": error.force / size,
-                "rms_error_per_A": error.measured / size, "relative": error.relative,
-                "in_e2_per_A2": error.measured / COULOMB, "estimated_per_A": error.estimated / size,
-                "largest_error_per_A": error.largest / size, "energy_error": error.energy / size,
-            }  # fmt: skip
+            found["accuracy"] = coulomb_errors(self.system, self.state, size)
         return found

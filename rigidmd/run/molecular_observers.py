@@ -1,11 +1,12 @@
 """Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state, energy.png."""
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from math import inf
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from rigidmd.core.files import atomic_file
-from rigidmd.core.state import NOW, State
+from rigidmd.core.state import NOW, Load, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.samples import Samples
 from rigidmd.figures.run import run_figures
@@ -15,7 +16,8 @@ from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
 from rigidmd.io.log import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
-from rigidmd.units import KJ_PER_MOL
+from rigidmd.scene.stage import Stage
+from rigidmd.units import FEMTOSECOND, KJ_PER_MOL
 
 if TYPE_CHECKING:
     from rigidmd.run.results import Results
@@ -26,12 +28,10 @@ class LogFile(GrowingFile):
     """log.csv: a line for each sample."""
 
     ends = reads_energies = True
+    _names = (LOG,)
 
     def __init__(self, interval: float, tensor: bool):
         self.interval, self._tensor = interval, tensor
-
-    def files(self) -> list[str]:
-        return [LOG]
 
     def begin(self, run: "Simulation") -> None:
         self._file = Log(run.path(LOG), self._tensor, self.kept, tuple(run.system.user_terms))
@@ -48,13 +48,11 @@ class PressureTensor(GrowingFile):
     """pressure_tensor.csv: the pressure tensor at its own interval; without a folder in memory."""
 
     once = reads_energies = True
+    _names = (TENSOR_FILE,)
 
     def __init__(self, interval: float):
         self.interval = interval
         self._rows: list[list[float]] = []
-
-    def files(self) -> list[str]:
-        return [TENSOR_FILE]
 
     def begin(self, run: "Simulation") -> None:
         self._file = None if run.folder is None else TensorFile(run.path(TENSOR_FILE), self.kept)
@@ -73,12 +71,12 @@ class PressureTensor(GrowingFile):
             results.files.append(run.path(TENSOR_FILE))
 
 
-class GoodState(NamedTuple):
-    """A state that passed all checks."""
-
-    step: int
-    time: float
-    state: State
+def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, stage: Stage) -> None:
+    """Raise the failed check of the next step of a stage, if the stage has steps."""
+    if not stage.is_minimisation:
+        dt = stage.timestep_fs * FEMTOSECOND
+        if problem := check.failed_check(run.state, load, stage.scheme, dt, run.engine.extent(run.state)):
+            raise problem
 
 
 class Sampler(Observer):
@@ -86,16 +84,14 @@ class Sampler(Observer):
 
     remembers: ClassVar[dict[str, Any]] = {"table": np.ndarray}
     ends = reads_energies = True
+    _names = (LAST_GOOD,)
 
     def __init__(self, run: "Simulation", interval: float, check: checks.StepCheck):
         self.interval = interval
         self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.user_terms))
-        self.last_good: GoodState | None = None
+        self.last_good: State | None = None
         self._run, self._check = run, check
         self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
-
-    def files(self) -> list[str]:
-        return [LAST_GOOD]
 
     def origin(self, stage: int) -> float | None:
         """Conserved energy (kJ/mol) at the start of a stage: of the last sample before it, or else of its first."""
@@ -111,22 +107,12 @@ class Sampler(Observer):
         kinetic = now.kinetic * KJ_PER_MOL
         if not self._check.thermal:
             self._check.rescale(kinetic)
-        if problem := self._check.failed_check(run.state, moment.observation.load, stage, run.part.extent):
-            raise problem
+        _check_next_step(run, self._check, moment.observation.load, stage)
         if problem := checks.check_sample(run.system, run.scene.watch, samples.row(since), now):
             raise problem
         self._check.rescale(kinetic)
-        self._keep(moment.step, moment.time)
-
-    def _keep(self, step: int, time: float) -> None:
-        """Copy the present state as the last good one, into the arrays of the one before."""
-        now, kept = self._run.state, self.last_good and self.last_good.state
-        if kept is None or any(there.shape != here.shape for there, here in zip(kept, now, strict=True)):
-            kept = now.copy()
-        else:
-            for there, here in zip(kept, now, strict=True):
-                there[:] = here
-        self.last_good = GoodState(step, time, kept)
+        self.last_good = None  # its memory is free for the next
+        self.last_good = run.state.copy()
 
     @property
     def table(self) -> np.ndarray:
@@ -140,9 +126,8 @@ class Sampler(Observer):
         """Restore the samples. The state of the checkpoint is the last good one."""
         super().resume(run, kept)
         samples = self.samples
-        steps, times, stages, conserved, drift = (
-            samples[name] for name in ("step", "time", "stage", "conserved", "drift")
-        )
+        names = ("step", "time", "stage", "conserved", "drift")
+        steps, times, stages, conserved, drift = map(samples.__getitem__, names)
         step, time = int(run.state.step[NOW]), float(run.state.time[NOW])
         series = ((steps, step), (times, time), (stages, len(samples.stages)))
         if not all(((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series):
@@ -154,14 +139,14 @@ class Sampler(Observer):
             raise ValueError("the drifts of its samples are not those of their energies")
         if len(samples):
             self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
-        self._keep(step, time)
+        self.last_good = run.state.copy()
 
     def failed(self, run: "Simulation") -> str:
         if run.folder is None or self.last_good is None:
             return ""
         path = run.path(LAST_GOOD)
-        write_state(path, run.system.saved(self.last_good.state))
-        return f". Last good state, of step {self.last_good.step} ({self.last_good.time:g} ps): {path}"
+        write_state(path, run.system.saved(self.last_good))
+        return f". Last good state, of step {self.last_good.step[NOW]} ({self.last_good.time[NOW]:g} ps): {path}"
 
 
 class StepWatch(Observer):
@@ -170,23 +155,25 @@ class StepWatch(Observer):
     ends = True
 
     def __init__(self, run: "Simulation", check: checks.StepCheck):
-        self.steps = checks.steps_between(run.system)
         self._run, self._check = run, check
+        interval, stages = run.scene.output.log_interval_ps, run.scene.stages
+        of_samples = [
+            inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
+            for stage in stages
+            if not stage.is_minimisation
+        ]
+        every = checks.check_interval(run.system)
+        self.steps = every if max(of_samples, default=0.0) > every else None  # samples come at least as often
 
     def see(self, moment: Moment) -> None:
-        run, load = self._run, self._run.engine.load
-        if load is None:
-            return  # no force has been evaluated yet
-        stage = run.scene.stages[moment.stage]
-        if problem := self._check.failed_check(run.state, load, stage, run.part.extent):
-            raise problem
+        if (load := self._run.engine.load) is not None:  # forces have been evaluated
+            _check_next_step(self._run, self._check, load, self._run.scene.stages[moment.stage])
 
 
 class FinalState(Observer):
     """final.npz: the exact state at the end."""
 
-    def files(self) -> list[str]:
-        return [FINAL]
+    _names = (FINAL,)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         write_state(run.path(FINAL), run.system.saved(run.state))
@@ -197,9 +184,7 @@ class EnergyFigure(Observer):
     """energy.png: drift, energies and temperatures."""
 
     draws = True
-
-    def files(self) -> list[str]:
-        return [ENERGY]
+    _names = (ENERGY,)
 
     def end(self, run: "Simulation", results: "Results") -> None:
         for figure in run_figures(run.system, results.samples, results.summary).values():

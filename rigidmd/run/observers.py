@@ -7,7 +7,7 @@ two states: with `once` only the second is observed. No observer depends on anot
 the moment or run.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -91,10 +91,11 @@ class Observer:
     once = False  # whether it is called once for each time: not before a minimisation
     draws = False  # whether it only draws: its `end` is called after the others, and its errors are notes
     reads_energies = False  # whether it reads forces or energies, which the last step then computes too
+    _names: Sequence[str] = ()
 
     def files(self) -> list[str]:
         """Names of all files that may be written."""
-        return []
+        return list(self._names)
 
     def begin(self, run: "Simulation") -> None:
         """Called before the first step; the folder exists."""
@@ -183,11 +184,8 @@ class GrowingFile(Observer):
 class SceneFile(Observer):
     """scene.toml, with copies of the files that the scene reads."""
 
-    def __init__(self, names: Iterable[str] = ()):
-        self._copies = list(names)
-
-    def files(self) -> list[str]:
-        return [SCENE, *self._copies]
+    def __init__(self, copies: Iterable[str] = ()):
+        self._names = [SCENE, *copies]
 
     def begin(self, run: "Simulation") -> None:
         """Write scene.toml. It is written again after an integrator has been chosen for a stage."""
@@ -218,9 +216,6 @@ class Frames(GrowingFile):
         self._names = [topology, trajectory]
         self._velocities, self._wrapped = velocities, wrapped
         self._frames: list[Frame] = []
-
-    def files(self) -> list[str]:
-        return self._names
 
     @property
     def times(self) -> np.ndarray:

@@ -7,7 +7,7 @@ from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, ORIGIN, State
 from rigidmd.run.observers import Moment
 from rigidmd.run.resume import RunRecord
-from rigidmd.run.segments import Segment
+from rigidmd.run.schedule import Segment
 
 if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation
@@ -25,7 +25,8 @@ class RunPart:
         if it is invalid
     observe(moment) : the observation, which `Moment.observation` keeps
     default_observers() : the observers that sample, check and write
-    samples(), summary(samples, times), summary_text(summary, known) : the samples, the summary, the latter as text
+    samples(), summary(samples, preparing, wall), summary_text(summary, known) : the samples; the summary, with seconds
+        of preparing (compiling, removal of overlaps) and of segments with observers and output; the latter as text
         without the notes in `known`
     explain(error) : an error in full: what was seen, the likely cause, what to try
     start_energy(...) : energies and forces at the start

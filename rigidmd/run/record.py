@@ -93,7 +93,14 @@ def read_record(folder: Path) -> Record:
     """Read the folder of a run, ended or not. Raises OutputError if it is no such folder, or has no samples."""
     check_is_run(folder)
     scene = Scene.read(folder / SCENE)
-    summary, missing = _summary(folder)
+    summary, missing = read_json(folder / SUMMARY, Summary), []
+    if summary is None:
+        missing.append(
+            f"This run has not ended: there is no {SUMMARY}. These are its results so far; "
+            f"`rigidmd resume {shlex.quote(str(folder))}` continues it."
+        )
+    elif summary.interrupted:
+        missing.append("This run was interrupted; these are its results so far.")
     if isinstance(scene, BodyScene):
         system = build_body(scene)
         columns = _motion(folder, system, missing)
@@ -104,18 +111,7 @@ def read_record(folder: Path) -> Record:
         raise OutputError(
             f"{folder}: the run has not written samples yet; `rigidmd resume {shlex.quote(str(folder))}` continues it"
         )
-    return Record(folder, scene, system, summary, columns, missing)
-
-
-def _summary(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    found = read_json(folder / SUMMARY, Summary)
-    if found is None:
-        return None, [
-            f"This run has not ended: there is no {SUMMARY}. These are its results so far; "
-            f"`rigidmd resume {shlex.quote(str(folder))}` continues it."
-        ]
-    ended = "This run was interrupted; these are its results so far."
-    return found.model_dump(exclude_unset=True), [ended] if found.interrupted else []
+    return Record(folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing)
 
 
 def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
@@ -147,18 +143,13 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
     return found
 
 
-def _columns_of(system: BodySystem) -> list[str]:
-    """Columns that every motion of a body has."""
-    families = ["time", "position", "kinetic", "potential", "energy", "work"]
-    if system.rotates:
-        families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
-    return [name for family in families for name in BODY[family].names]
-
-
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
     if (found := read_columns(folder / MOTION)) is not None:
-        needed = _columns_of(system)
+        families = ["time", "position", "kinetic", "potential", "energy", "work"]  # that every motion has
+        if system.rotates:
+            families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
+        needed = [name for family in families for name in BODY[family].names]
         if lacking := [header for name in needed if (header := BODY_COLUMNS[name].header) not in found.cells]:
             raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
         names = {header: BODY_HEADERS.get(header, header) for header in found.cells}
@@ -169,7 +160,7 @@ def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, n
         return {}
     for owner in kept.values.get("of", {}):
         part = kept.of(owner).arrays
-        if "stacked/t" in part:  # of `run.body_observers.Sampler`
+        if "stacked/t" in part:  # of `run.body.Sampler`
             states = zip(*(part[f"stacked/{name}"] for name in STORED_NAMES), strict=True)
             times = part["stacked/t"].tolist()
             snapshots = [Snapshot(t, State(*state)) for t, state in zip(times, states, strict=True)]

@@ -1,20 +1,13 @@
-"""The summary of a run: summary.json, and as text."""
+"""The summary of a run as text."""
 
 from collections.abc import Container
-from pathlib import Path
 
 from rigidmd.core.statistics import NO_ERROR, format_signed
-from rigidmd.io.write import write_json
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
     "wrapped": "molecules are wrapped into the box; displacements need unwrapped frames",
 }
-
-
-def write_summary(path: Path, summary: dict) -> None:
-    """summary.json."""
-    write_json(path, summary, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def summary_text(summary: dict, known: Container[str] = ()) -> str:
@@ -27,8 +20,7 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
         f"{summary['degrees_of_freedom_rotation']} rotation)"
     ]
     for stage in summary["stages"]:
-        lines += ["", stage_title(stage)]
-        lines += _as_lines(stage_rows(stage))
+        lines += ["", stage_title(stage), *_as_lines(stage_rows(stage))]
     momentum = f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the sum of |m v|"
     rows = [_orthogonality(summary), ("momentum", momentum)]
     if removed := summary["momentum_removed"]:
@@ -92,9 +84,11 @@ def stage_title(stage: dict) -> str:
 
 def _minimum_rows(stage: dict, found: dict) -> list[tuple[str, str]]:
     before, after = found["energy_before_kJ_mol_per_molecule"], found["energy_after_kJ_mol_per_molecule"]
-    rows = [("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after")]
-    torque = f", torque {found['largest_torque_kJ_mol']:.2g} kJ/mol"
-    rows.append(("largest force", f"{found['largest_force_kJ_mol_A']:.2g} kJ/(mol Å){torque}"))
+    force, torque = found["largest_force_kJ_mol_A"], found["largest_torque_kJ_mol"]
+    rows = [
+        ("potential", f"{before:.6g} before, {after:.6f} kJ/mol per molecule after"),
+        ("largest force", f"{force:.2g} kJ/(mol Å), torque {torque:.2g} kJ/mol"),
+    ]
     if found["pressure_bar"] is not None:
         off = found["largest_pressure_deviation_bar"]
         more = "" if off is None else f", within {off:.2g} bar of the given pressure"
@@ -112,9 +106,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     if stage["temperature_K"] is not None:
-        parts = _temperatures(stage, "K")
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
-        rows.append(("temperature", f"{value} ({parts})"))
+        rows.append(("temperature", f"{value} ({_temperatures(stage, 'K')})"))
         if parts := _temperatures(stage, "unbiased_K"):
             rows.append(("", f"{parts} without the error of the time step"))
     rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
@@ -135,10 +128,10 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
         if stage["drift_over_kinetic_std"] is not None:
-            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations"
-            rows.append(("", f"{deviations} of the kinetic energy in total"))
-        noise = f"{stage['energy_rms_kJ_mol_per_molecule']:.2g} kJ/mol per molecule"
-        rows.append(("energy noise", f"{noise}, rms about the line"))
+            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total"
+            rows.append(("", deviations))
+        noise = stage["energy_rms_kJ_mol_per_molecule"]
+        rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms about the line"))
     return rows
 
 
@@ -148,6 +141,5 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
 
 
 def _temperatures(stage: dict, suffix: str) -> str:
-    motions = (("T_trans", "translation"), ("T_rot", "rotation"))
-    values = [(name, stage[f"temperature_{motion}_{suffix}"]) for name, motion in motions]
-    return ", ".join(f"{name} {value:.2f}" for name, value in values if value is not None)
+    motions = (("T_trans", f"temperature_translation_{suffix}"), ("T_rot", f"temperature_rotation_{suffix}"))
+    return ", ".join(f"{name} {stage[key]:.2f}" for name, key in motions if stage[key] is not None)

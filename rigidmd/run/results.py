@@ -123,7 +123,7 @@ class Results(Displayed):
         and stress; other frames have the digits of the trajectory (single precision but for .traj) and the energy
         where the log has a line at their time. Raises ValueError for a body or without frames, IndexError.
         """
-        from rigidmd.run.ase_frames import atoms_of_results
+        from rigidmd.run.atom_forces import atoms_of_results
 
         return atoms_of_results(self, frame)
 

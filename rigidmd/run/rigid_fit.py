@@ -22,10 +22,8 @@ class RigidFit:
     """Fits the molecules of a system, with the axes of `rigidmd models NAME`, to frames of sites."""
 
     def __init__(self, system: System):
-        self._kinds = kinds_of(system)
-        self._templates = [_template(kind.molecule) for kind in self._kinds]
-        self._n = len(system.model.species)
-        self._rotates = len(system.state.rotation) > 0
+        self._kinds = [(kind, _Template(kind.molecule)) for kind in kinds_of(system)]
+        self._n, self._rotates = len(system.model.species), len(system.state.rotation) > 0
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
         """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.
@@ -34,9 +32,8 @@ class RigidFit:
         """
         centre = np.empty((self._n, 3))
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
-        velocity = None if velocities is None else np.empty((self._n, 3))
-        L = None if velocities is None else np.zeros((len(Q), 3))
-        for kind, fit in zip(self._kinds, self._templates, strict=True):
+        velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))
+        for kind, fit in self._kinds:
             at, index = sites[kind.sites].astype(float), kind.index
             middle = at.mean(axis=1)
             rotation = fit.rotations_onto(at - middle[:, None])
@@ -50,25 +47,28 @@ class RigidFit:
                 )
             if self._rotates:
                 Q[index] = rotation
-            if velocity is not None and L is not None and velocities is not None:
+            if velocities is not None:
                 v, mass = velocities[kind.sites].astype(float), kind.molecule.masses
                 mean = np.einsum("s,nsi->ni", mass, v) / kind.molecule.mass
                 velocity[index] = mean
                 if self._rotates:
                     lab = np.einsum("s,nsi->ni", mass, np.cross(arms, v - mean[:, None]))
                     L[index] = np.einsum("nij,ni->nj", rotation, lab)
-        return Bodies(centre, Q, velocity, L)
+        return Bodies(centre, Q, None, None) if velocities is None else Bodies(centre, Q, velocity, L)
 
 
-class _Template(NamedTuple):
+class _Template:
     """The sites of a molecule in its body frame, which extend in r dimensions.
 
     middle (3,) : mean of the sites; weights (s, r), columns (r, 3) : of the singular value decomposition
     """
 
-    middle: np.ndarray
-    weights: np.ndarray
-    columns: np.ndarray
+    def __init__(self, molecule: Molecule):
+        body = molecule.positions_body
+        self.middle = body.mean(axis=0)
+        left, sizes, columns = np.linalg.svd(body - self.middle, full_matrices=False)
+        rank = int((sizes > FLAT * max(sizes[0], np.abs(body).max())).sum()) if sizes[0] > 0 else 0
+        self.weights, self.columns = left[:, :rank] / sizes[:rank], columns[:rank]
 
     def rotations_onto(self, arms: np.ndarray) -> np.ndarray:
         """Rotations (n, 3, 3) of the template onto sites (n, s, 3) about their middle."""
@@ -82,14 +82,6 @@ class _Template(NamedTuple):
         axes[:, 1] /= np.linalg.norm(axes[:, 1], axis=1)[:, None]
         axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
         return np.einsum("nri,rj->nij", axes, _right_handed(self.columns))
-
-
-def _template(molecule: Molecule) -> _Template:
-    body = molecule.positions_body
-    middle = body.mean(axis=0)
-    left, sizes, columns = np.linalg.svd(body - middle, full_matrices=False)
-    rank = int((sizes > FLAT * max(sizes[0], np.abs(body).max())).sum()) if sizes[0] > 0 else 0
-    return _Template(middle, left[:, :rank] / sizes[:rank], columns[:rank])
 
 
 def _right_handed(rows: np.ndarray) -> np.ndarray:

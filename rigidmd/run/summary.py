@@ -2,7 +2,7 @@
 
 from collections import Counter
 from math import isnan, sqrt
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,11 @@ from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Sample, Samples
 from rigidmd.engines.system import System
-from rigidmd.run.segments import RunTimes
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
+
+if TYPE_CHECKING:
+    from rigidmd.run.molecular import MolecularRecord
 
 #: Keys of a stage that are None for a minimisation.
 MOTION_KEYS = (
@@ -56,32 +58,25 @@ class Minimum(NamedTuple):
 
 
 def summarise(
-    system: System, samples: Samples, state: State, overlap_steps: int, times: RunTimes, interrupted: bool,
-    choices: dict[int, str], stable: dict[int, float], moves: dict[int, tuple[int, int]], minima: dict[int, Minimum],
-    warnings: list[str],
+    system: System, record: "MolecularRecord", samples: Samples, state: State, preparing: float, wall: float,
+    interrupted: bool,
 ) -> dict:  # fmt: skip
-    """The summary of a run of molecules, without its `provenance`. Dictionaries have the indices of stages.
-
-    overlap_steps : of the removal of overlaps; choices : choice and reason where the integrator was open
-    stable : the longest stable step (ps), as estimated at the start of the stage
-    moves : trial moves of the box, tried and accepted; minima : results of minimisations
-    """
-    scene = system.scene
-    last = samples.row(-1)
+    """The summary of a run of molecules, without its `provenance`; seconds as in `RunPart.summary`."""
+    scene, minima, computing, last = system.scene, record.minima, record.position.computing, samples.row(-1)
     size = float(system.model.mass[system.model.species] @ np.linalg.norm(state.velocity, axis=1))  # sum of |m v|
-    moving = [k for k in range(len(times.computing)) if k not in minima]
-    stages = [
-        (
-            _stage(system, samples, k, times.computing[k], moves.get(k, (0, 0)))
-            if k not in minima
-            else _minimised(system, samples, k, times.computing[k], minima[k])
-        )
-        | {
-            "choice": _choice(system, samples.of_stage(k), k, choices.get(k)),
-            "stable_timestep_fs": stable[k] / FEMTOSECOND if k in stable else None,
-        }
-        for k in np.unique(samples["stage"]).tolist()
-    ]
+    moving = [k for k in range(len(computing)) if k not in minima]
+    stages = []
+    for k in np.unique(samples["stage"]).tolist():
+        if k in minima:
+            values = _minimised(system, samples, k, computing[k], minima[k])
+        else:
+            values = _stage(system, samples, k, computing[k], record.moves.get(k, (0, 0)))
+        stable = record.stable[k] / FEMTOSECOND if k in record.stable else None
+        choice = _choice(system, samples.of_stage(k), k, record.choices.get(k))
+        stages.append(values | {"choice": choice, "stable_timestep_fs": stable})
+    removed, interval = None, system.removes_momentum_every
+    if interval is not None:
+        removed = {"interval_ps": interval, "energy_kJ_mol": -float(state.energy_ledger[REMOVED]) / KJ_PER_MOL}
     return {
         "interrupted": interrupted, "molecules": len(system.model.species),
         "species": {m.name: 0 for m in system.species} | Counter(system.species[k].name for k in system.model.species),
@@ -91,14 +86,15 @@ def summarise(
         "box_A": list(system.space) if system.density else None, "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
-        "relief_steps": overlap_steps, "preparing_s": times.preparing, "wall_s": times.wall,
+        "relief_steps": record.removal.steps if record.removal else 0,
+        "preparing_s": preparing, "wall_s": wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()), "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
-        "own_forces": dict(system.user_terms), "momentum_removed": _momentum_removed(system, state), "stages": stages,
+        "own_forces": dict(system.user_terms), "momentum_removed": removed, "stages": stages,
         "notes": [
             *system.notes, *_common_drift_notes(system, state, last), *ewald_error_notes(system, state),
-            *(note for k in moving for note in _notes_on_averages(system, samples, k)), *warnings,
+            *(note for k in moving for note in _notes_on_averages(system, samples, k)), *record.notes,
         ],
     }  # fmt: skip
 
@@ -110,16 +106,6 @@ def _choice(system: System, samples: Samples, k: int, text: str | None) -> str |
         return text
     rms, time = float(np.sqrt(np.mean(samples["drift"] ** 2))) / thermal, samples["time"]
     return f"{text}. In the {time[-1] - time[0]:.4g} ps that ran it was {rms:.1e}"
-
-
-def _momentum_removed(system: System, state: State) -> dict | None:
-    """Energy removed with the total momentum in the whole run; None if none is removed."""
-    if system.removes_momentum_every is None:
-        return None
-    return {
-        "interval_ps": system.removes_momentum_every,
-        "energy_kJ_mol": -float(state.energy_ledger[REMOVED]) / KJ_PER_MOL,
-    }
 
 
 def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]:
@@ -218,8 +204,7 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
     first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
-    n = len(system.model.species)
-    steps = of_stage.row(-1).step - first.step
+    n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
     line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
@@ -262,9 +247,8 @@ def _minimised(system: System, samples: Samples, k: int, computing: float, found
 def _box_means(of_stage: Samples) -> dict:
     """Means of density and edges of the box, with their errors."""
     found = {}
-    for name, key in (("density", "density{}_g_cm3"), ("a", "a{}_A"), ("b", "b{}_A"), ("c", "c{}_A")):
-        value, error = mean_and_error(of_stage[name])
-        found |= {key.format(""): value, key.format("_error"): error}
+    for name, unit in (("density", "g_cm3"), ("a", "A"), ("b", "A"), ("c", "A")):
+        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(of_stage[name])
     return found
 
 
@@ -296,15 +280,15 @@ def describe_minimum(found: Minimum, stage: Stage) -> str:
     if found.deviation is not None:
         parts.append(("deviation of the pressure", found.deviation / BAR, stage.pressure_limit_bar, "bar"))
     reached = ", ".join(f"{what} {value:.3g} (limit {limit:g}) {unit}" for what, value, limit, unit in parts)
-    return (
-        f"the minimisation has not converged after {found.iterations} iterations ({found.ended_by}): largest {reached}"
-    )
+    how = f"after {found.iterations} iterations ({found.ended_by})"
+    return f"the minimisation has not converged {how}: largest {reached}"
 
 
-def summarise_body(system: BodySystem, motion: Motion, planned: int, times: RunTimes, interrupted: bool) -> dict:
+def summarise_body(
+    system: BodySystem, motion: Motion, planned: int, preparing: float, wall: float, computing: float, interrupted: bool
+) -> dict:
     """The summary of a run of a single body, without its `provenance`. planned : steps of a run that ends in time"""
-    run, computing = system.scene.run, sum(times.computing)
-    end = float(motion["time"][-1])
+    run, end = system.scene.run, float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     angles = np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist() if system.rotates else None
     return {
@@ -312,7 +296,7 @@ def summarise_body(system: BodySystem, motion: Motion, planned: int, times: RunT
         "degrees_of_freedom": system.degrees_of_freedom, "mass_kg": system.mass,
         "inertia_kg_m2": system.inertia.tolist(), "integrator": run.integrator,
         "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
-        "duration_s": end, "samples": len(motion), "preparing_s": times.preparing, "wall_s": times.wall,
+        "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
         "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
         "energy_start_J": float(motion["energy"][0]), "energy_end_J": float(motion["energy"][-1]),
         "work_J": float(motion["work"][-1]),

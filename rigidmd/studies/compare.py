@@ -14,7 +14,7 @@ from rigidmd.core.toml import read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
 from rigidmd.io.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.io.run_files import Columns, Summary, read_columns, read_json
-from rigidmd.run.provenance import differences, keys_of
+from rigidmd.run.resume import differences, keys_of
 
 #: Keys of summary.json that are compared besides the scene.
 VERSIONS_AND_MACHINE = (

@@ -62,4 +62,4 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
 def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
     scene = system.scene.model_copy(update={"engine": EngineChoice()})
-    return Simulation(scene, warn=lambda sentence: None).settle()
+    return Simulation(scene, warn=lambda sentence: None).part.settle()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import SCHEMES, choice, walk
+from support import SCHEMES, choice
 
 from rigidmd import Scene, Simulation
 from rigidmd.errors import SimulationError
@@ -44,12 +44,12 @@ def counted(made: Callable[[], Simulation]) -> tuple:
         forces[0] += trial.steps * subject.methods[trial.integrator].force_evaluations
         return measure_errors(subject, trial, *more)
 
-    choice.measure_errors = walk.measure_errors = counting
+    choice.measure_errors = counting
     try:
         simulation = made()
         return simulation, simulation.run(), forces[0]
     finally:
-        choice.measure_errors = walk.measure_errors = measure_errors
+        choice.measure_errors = measure_errors
 
 
 def of_molecules(name: str, target: float, duration: float) -> list[str]:

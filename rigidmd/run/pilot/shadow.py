@@ -32,6 +32,7 @@ from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.choice import round_down
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene.stage import Stage
+from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Bias of U in kT per degree of freedom, in x.
@@ -54,12 +55,11 @@ def sums_of_square_frequencies(system: System, engine: Engine, state: State, the
 
     By equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over the canonical distribution.
     """
-    load, _ = engine.evaluate(state)
+    (force, torque), _ = engine.evaluate(state)
     model = system.model
-    translation = float((load.force**2).sum(axis=1) @ model.inverse_mass[model.species]) / thermal
-    if not len(load.torque_body):
-        return translation, 0.0
-    return translation, float((load.torque_body**2 * model.inverse_inertia[model.species]).sum()) / thermal
+    translation = float((force**2).sum(axis=1) @ model.inverse_mass[model.species])
+    rotation = float((torque**2 * model.inverse_inertia[model.species][: len(torque)]).sum())
+    return translation / thermal, rotation / thermal
 
 
 def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:
@@ -74,12 +74,8 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     Verlet with velocity rescaling, or BAOAB with Langevin's. Raises SimulationError.
     """
     stage = system.scene.stages[k]
-    target = stage.bias_kT
-    if target is None:
-        raise ValueError("the stage has no bias_kT")
-    found = stiffest_mode(system, state)
-    rate = mean_square_rate(system, state, k)
-    steps = {}
+    target, steps = not_none(stage.bias_kT), {}
+    found, rate = stiffest_mode(system, state), mean_square_rate(system, state, k)
     for integrator in BIAS:
         if integrator == "baoab" and not (stage.thermostat_is_open or stage.thermostat == "langevin"):
             continue
@@ -99,10 +95,8 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
 
 
 def _decided(stage: Stage, integrator: str, timestep_fs: float) -> Stage:
-    decided = stage.with_integrator(integrator, timestep_fs)
-    if integrator == "baoab":
-        decided = decided.model_copy(update={"thermostat": "langevin"})
-    return decided.with_defaults
+    thermostat = {"thermostat": "langevin"} if integrator == "baoab" else {}
+    return stage.with_integrator(integrator, timestep_fs).model_copy(update=thermostat).with_defaults
 
 
 def mean_square_rate(system: System, state: State, k: int) -> float:

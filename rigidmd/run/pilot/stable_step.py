@@ -2,6 +2,7 @@
 
 from functools import cache
 from math import inf, sqrt
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,6 @@ from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.scene import MolecularScene
-from rigidmd.scene.models import Molecule
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Force evaluations for the stiffest motion; its frequency is then exact to a few percent.
@@ -44,14 +44,12 @@ def stable_angle(method: Scheme | Solver) -> float:
         return 2 * sqrt(2) if method.name == RK4 else inf
     angle = np.linspace(0, 30, 30_001)
     z = angle**2
-    one, none = np.ones_like(z), np.zeros_like(z)
-    x, v = (one, none), (none, one)  # rows of the matrix, of (x, v dt)
+    x, v = np.tile(np.eye(2)[:, :, None], len(z))  # rows of the matrix, of (x, v dt)
     for flow in method.flows:
         if flow.kind == KICK:
-            push = flow.fraction * z * (1 - flow.gradient * z)
-            v = tuple(b - push * a for a, b in zip(x, v, strict=True))
+            v = v - flow.fraction * z * (1 - flow.gradient * z) * x
         elif flow.kind == DRIFT:
-            x = tuple(a + flow.fraction * b for a, b in zip(x, v, strict=True))
+            x = x + flow.fraction * v
     beyond = np.abs(x[0] + v[1]) > 2 + 1e-9
     return float(angle[beyond.argmax()]) if beyond.any() else inf
 
@@ -139,39 +137,25 @@ def step_warnings(scene: MolecularScene) -> list[str]:
         temperature = max(stage.temperatures) or temperature
         if stage.is_auto or stage.is_minimisation or not (species and temperature and scene.watch.stable_step):
             continue
-        swings = [swing for m in species for swing in _swings(m, BOLTZMANN * temperature)]
-        shortest = min(swings, key=lambda swing: swing.time)
-        longest, dt = stable_angle(stage.scheme) * shortest.time, stage.timestep_fs * FEMTOSECOND
+        thermal, swings = BOLTZMANN * temperature, []
+        for m in species:
+            diameter = max((sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0), default=inf)
+            lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
+            size, rotation = SWING_DIAMETERS, "rotates about its lightest axis"
+            swings += [
+                (size * diameter * sqrt(m.mass / thermal), size, "diameters", m.name, "moves"),
+                (SWING_RAD * sqrt(lightest / thermal), SWING_RAD, "rad", m.name, rotation),
+            ]
+        # time (ps) for the amplitude at the thermal speed, the amplitude
+        time, size, unit, name, does = min(swings, key=itemgetter(0))
+        longest, dt = stable_angle(stage.scheme) * time, stage.timestep_fs * FEMTOSECOND
         if dt > longest:
             warnings.append(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is too long for {shortest.name} at {temperature:g} "
-                f"K: in a step it {shortest.does} by {dt / shortest.time * shortest.size:.2g} {shortest.unit} (rms); "
-                f"{stage.integrator} is stable up to {longest / FEMTOSECOND:.3g} fs where, as in liquids, the stiffest "
-                f"motions swing by {shortest.size:g} {shortest.unit}"
+                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is too long for {name} at {temperature:g} K: in a "
+                f"step it {does} by {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to "
+                f"{longest / FEMTOSECOND:.3g} fs where, as in liquids, the stiffest motions swing by {size:g} {unit}"
             )
     return warnings
-
-
-class _Swing(NamedTuple):
-    """The stiffest motion of a molecule in a liquid."""
-
-    time: float  # ps, for the amplitude at its thermal speed
-    size: float
-    unit: str
-    name: str
-    does: str
-
-
-def _swings(m: Molecule, thermal: float) -> list[_Swing]:
-    """The stiffest translation and rotation of a molecule. thermal : kT, u Å²/ps²"""
-    diameter = max((sigma for sigma, epsilon in zip(m.sigma, m.epsilon, strict=True) if epsilon > 0), default=inf)
-    moves = SWING_DIAMETERS * diameter * sqrt(m.mass / thermal)
-    lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
-    rotates = SWING_RAD * sqrt(lightest / thermal)
-    return [
-        _Swing(moves, SWING_DIAMETERS, "diameters", m.name, "moves"),
-        _Swing(rotates, SWING_RAD, "rad", m.name, "rotates about its lightest axis"),
-    ]
 
 
 def is_estimate_cheap(system: System, evaluations: int) -> bool:

@@ -11,7 +11,7 @@ from math import ceil, gcd, inf, sqrt
 import numpy as np
 
 from rigidmd.assemble.body import build_body
-from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme
+from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Solver
 from rigidmd.core.state import State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.engines.body_system import BodySystem, Pose
@@ -19,12 +19,12 @@ from rigidmd.engines.observables import observe
 from rigidmd.engines.ode.rates import SMALLEST_SINE
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
-from rigidmd.run.pilot.choice import Choice, choose
+from rigidmd.run.pilot.choice import choose
+from rigidmd.run.pilot.shadow import sums_of_square_frequencies
 from rigidmd.run.pilot.trials import Method, TrialSystem
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SAMPLES
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: General ODE solvers for the textbook equations of a body, for comparison with the engine's schemes.
@@ -40,28 +40,19 @@ PILOT_PART, LEAST_SPAN = 0.01, 3.0
 COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
 
 
-def _on_rotor(scheme: Scheme, rotor: str | None) -> Scheme:
-    """The scheme with the rotor of the scene if it supports it."""
-    return scheme if scheme.exact_rotor else scheme.with_rotor(rotor)
-
-
 def natural_time(system: System, state: State) -> float | None:
     """Time (ps) of one radian of the faster of vibration and libration; None at rest.
 
     Its inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion; likewise for torques.
     """
-    engine = system.engine()
-    load, _ = engine.evaluate(state)
-    mass, inverse = system.model.mass[system.model.species], system.model.inverse_mass[system.model.species]
-    rates = [_ratio((load.force**2).sum(axis=1) @ inverse, mass @ (state.velocity**2).sum(axis=1))]
-    if len(load.torque_body):
-        inverse = system.model.inverse_inertia[system.model.species]
-        rates.append(_ratio((load.torque_body**2 * inverse).sum(), (state.angular_momentum_body**2 * inverse).sum()))
-    return 1 / sqrt(max(rates)) if max(rates) > 0 else None
-
-
-def _ratio(a: float, b: float) -> float:
-    return float(a / b) if b > 0 else 0.0
+    model, momentum = system.model, state.angular_momentum_body
+    motions = (
+        float(model.mass[model.species] @ (state.velocity**2).sum(axis=1)),
+        float((momentum**2 * model.inverse_inertia[model.species][: len(momentum)]).sum()),
+    )
+    forces = sums_of_square_frequencies(system, system.engine(), state, 1.0)
+    fastest = max(force / motion if motion > 0 else 0.0 for force, motion in zip(forces, motions, strict=True))
+    return 1 / sqrt(fastest) if fastest > 0 else None
 
 
 def molecular_trial_system(system: System, start: State, rotor: str | None, span: float) -> TrialSystem:
@@ -90,7 +81,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
     return TrialSystem(
         name=system.scene.name, state=state,
         methods={
-            name: Method(lambda: system.engine(), _on_rotor(scheme, rotor))
+            name: Method(lambda: system.engine(), scheme if scheme.exact_rotor else scheme.with_rotor(rotor))
             for name, scheme in system.scene.schemes.items()
         },
         energy=lambda engine, now: observe(system, engine, now, energy_unit=1.0).conserved,
@@ -105,8 +96,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
 
 def _change(before: np.ndarray, after: np.ndarray) -> float:
     """Change of the sum over molecules of vectors (n, 3), relative to the sum of their lengths."""
-    size = float(np.linalg.norm(before, axis=1).sum())
-    return float(np.linalg.norm((after - before).sum(axis=0))) / (size or 1.0)
+    return float(np.linalg.norm((after - before).sum(axis=0)) / (np.linalg.norm(before, axis=1).sum() or 1.0))
 
 
 def _angular_momenta(state: State, mass: np.ndarray) -> np.ndarray:
@@ -151,11 +141,11 @@ def body_trial_system(
         seen = motion(system, [start, Snapshot(float(state.time[0]), state)])
         return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
 
-    schemes = {name: _on_rotor(scheme, run.rotor) for name, scheme in scene.schemes.items()}
-    methods = {
-        name: Method(fit.engine, schemes[name] if name in schemes else fit.method._replace(duration=whole))
-        for name, fit in fits.items()
-    }
+    methods = {}
+    for name, fit in fits.items():
+        scheme = scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=whole)
+        scheme = scheme if isinstance(scheme, Solver) or scheme.exact_rotor else scheme.with_rotor(run.rotor)
+        methods[name] = Method(fit.engine, scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
         (name for name in fits if name in SCHEMES),
@@ -200,8 +190,7 @@ def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, s
         for name, scheme in SCHEMES.items()
         if scheme.exact_rotor or scheme.order == 2  # the others need more forces, and are for bodies without that rotor
     }
-    targets = stage.energy_error_kT, stage.trajectory_error
-    found = _choose_step(trial_system, longest, *targets, stage.duration)
+    found = choose(trial_system, longest, stage.energy_error_kT, stage.trajectory_error, stage.duration)
     return stage.with_integrator(found.integrator, found.timestep), found.reason
 
 
@@ -214,7 +203,7 @@ def choose_for_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]
     run = scene.run
     trial_system, _ = body_trial_system(scene, applied=applied)
     longest = {name: run.timestep_s for name in trial_system.methods if name in SCHEMES}
-    found = _choose_step(trial_system, longest, run.energy_error, run.trajectory_error)
+    found = choose(trial_system, longest, run.energy_error, run.trajectory_error)
     chosen, timestep = found.timestep, _fit_step(found.timestep, run.duration_s, scene.output.interval_s)
     fitted = "" if timestep == chosen else f", shortened to {timestep:g} s to fit duration and samples"
     none = {"energy_error": None, "trajectory_error": None}
@@ -234,13 +223,3 @@ def _fit_step(timestep: float, duration: float, interval: float | None) -> float
     common, longest = float(Fraction(gcd(a * d, c * b), b * d)), min(timestep, interval)
     span = common if common >= MIN_STEP_FRACTION * longest else duration
     return span / ceil(span / longest * (1 - 1e-9))
-
-
-def _choose_step(
-    trial_system: TrialSystem, longest: dict[str, float], energy: float | None, trajectory: float | None,
-    duration: float | None = None,
-) -> Choice:  # fmt: skip
-    """The choice for a limit of the energy error, or else of the error of the trajectory."""
-    if energy is not None:
-        return choose(trial_system, energy, "energy_rms", longest, duration)
-    return choose(trial_system, not_none(trajectory), "trajectory_error", longest)

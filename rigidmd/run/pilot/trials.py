@@ -214,10 +214,9 @@ def measure(
     extend : whether longer steps than the longest one of each integrator are tried, doubled until one fails
     """
     most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
-    reference = system.methods[system.reference]
-    steps = 2 * -(-2 * most // reference.force_evaluations)
-    exact = final_state(system, reference, steps)
-    differences = state_difference(exact, final_state(system, reference, steps // 2))
+    steps = 2 * -(-2 * most // system.methods[system.reference].force_evaluations)
+    exact = final_state(system, steps)
+    differences = state_difference(exact, final_state(system, steps // 2))
     result = IntegratorAccuracy(system, trials, steps, max(x for x in differences if not np.isnan(x)), averages)
     for trial in trials:  # compile and measure errors
         measure_errors(system, trial, exact)
@@ -245,9 +244,7 @@ def _extended(system: TrialSystem, trials: list[Trial], exact: State) -> list[Tr
         ladder = list(group)
         longest = max(ladder, key=lambda trial: trial.timestep)
         while not longest.diverged and longest.tolerance is None and longest.steps >= 2 * MIN_STEPS:
-            n = longest.steps // 2
-            per_step = system.methods[name].force_evaluations
-            longest = Trial(name, system.span / n / system.time_size, n, n * per_step)
+            longest = trial_of(system, name, longest.steps // 2)
             measure_errors(system, longest, exact)
             ladder.insert(0, longest)
         found += ladder
@@ -259,12 +256,12 @@ def time_span(system: TrialSystem, trial: Trial) -> float:
 
     The cost of a call without steps is subtracted: 15 µs, as much as 200 steps of a free body.
     """
-    engine, state = _begin_trial(system, trial)
+    engine, state, advance_to = _begin_trial(system, trial)
     begun, done = state.copy(), 0
 
     def seconds_of(steps: int) -> float:
         began = clock.perf_counter()
-        _advance(system, engine, state, trial, steps, done)
+        advance_to(done + steps)
         return clock.perf_counter() - began
 
     def start_again() -> None:
@@ -301,41 +298,37 @@ def plan(system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
     """
     trials = {}
     for integrator, timesteps in steps.items():
-        method = system.methods[integrator]
-        if method.chooses_steps:
+        if system.methods[integrator].chooses_steps:
+            step = system.span / OBSERVATIONS / system.time_size
             for tolerance in TOLERANCES:
-                step = system.span / OBSERVATIONS / system.time_size
                 trials[integrator, tolerance] = Trial(integrator, step, OBSERVATIONS, 0, tolerance=tolerance)
             continue
         for timestep in timesteps:
             n = max(1, round(system.span / (timestep * system.time_size)))
-            step = system.span / n / system.time_size
-            trials[integrator, n] = Trial(integrator, step, n, n * method.force_evaluations)
+            trials[integrator, n] = trial_of(system, integrator, n)
     return list(trials.values())
 
 
-def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State]:
-    """A new engine for a trial, and its state at the start."""
+def trial_of(system: TrialSystem, integrator: str, steps: int) -> Trial:
+    """A trial of this many steps in the span."""
+    timestep = system.span / steps / system.time_size
+    return Trial(integrator, timestep, steps, steps * system.methods[integrator].force_evaluations)
+
+
+def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Callable[[int], None]]:
+    """A new engine, a state at the start, and a function that advances it to a number of steps since the start."""
     method = system.methods[trial.integrator]
-    engine = method.engine()
-    return engine, engine.begin(system.state, _scheme_of(method, trial))
+    engine, scheme, dt = method.engine(), method.scheme, trial.timestep * system.time_size
+    if trial.tolerance is not None:
+        scheme = scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
+        dt = system.span / trial.steps
+    state = engine.begin(system.state, scheme)
+    return engine, state, lambda steps: engine.advance(state, scheme, dt, steps)
 
 
-def _scheme_of(method: Method, trial: Trial) -> Scheme | Solver:
-    """The method's scheme or solver, with the tolerance of a trial if it has one."""
-    if not method.chooses_steps:
-        return method.scheme
-    return method.scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
-
-
-def _advance(system: TrialSystem, engine: Engine, state: State, trial: Trial, steps: int, done: int = 0) -> None:
-    method = system.methods[trial.integrator]
-    dt = system.span / trial.steps if method.chooses_steps else trial.timestep * system.time_size
-    engine.advance(state, _scheme_of(method, trial), dt, done + steps)
-
-
-def final_state(system: TrialSystem, method: Method, steps: int) -> State:
-    """The state at the end of the span after this many steps."""
+def final_state(system: TrialSystem, steps: int) -> State:
+    """The state at the end of the span after this many steps of the reference."""
+    method = system.methods[system.reference]
     engine = method.engine()
     state = engine.begin(system.state, method.scheme)
     engine.advance(state, method.scheme, system.span / steps, steps)
@@ -344,23 +337,20 @@ def final_state(system: TrialSystem, method: Method, steps: int) -> State:
 
 def state_difference(a: State, b: State) -> tuple[float, float]:
     """Largest differences of rotations and positions; NaN if a state has none."""
-    return _largest_difference(a.rotation, b.rotation), _largest_difference(a.position, b.position)
-
-
-def _largest_difference(x: np.ndarray, y: np.ndarray) -> float:
-    return float(np.abs(x - y).max()) if len(x) else np.nan
+    position = float(np.abs(a.position - b.position).max()) if len(a.position) else np.nan
+    return (float(np.abs(a.rotation - b.rotation).max()) if len(a.rotation) else np.nan), position
 
 
 def measure_errors(system: TrialSystem, trial: Trial, exact: State | None, observations: int = OBSERVATIONS) -> None:
     """Run a trial and measure all its errors. Its end is compared with `exact`."""
-    engine, state = _begin_trial(system, trial)
+    engine, state, advance_to = _begin_trial(system, trial)
     first = system.energy(engine, state)
     times, energies = [0.0], [0.0]
     every, done = max(1, trial.steps // observations), 0
     while done < trial.steps:
         now = min(every, trial.steps - done)
         try:
-            _advance(system, engine, state, trial, now, done)
+            advance_to(done + now)
             energy = system.energy(engine, state) - first
         except NotFiniteError:
             energy = np.inf
@@ -393,14 +383,14 @@ def _average(system: TrialSystem, trial: Trial, length: float) -> None:
     observe = system.observe
     if observe is None:
         raise ValueError("averages are for molecules in a box")
-    engine, state = _begin_trial(system, trial)
+    engine, state, advance_to = _begin_trial(system, trial)
     dt = trial.timestep * system.time_size
     verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
     every = max(1, round(SAMPLING_INTERVAL_PS / dt))
     seen: list[Observation] = []
     for k in range(max(2, round(length / dt / every))):
         try:
-            _advance(system, engine, state, trial, every, k * every)
+            advance_to((k + 1) * every)
         except SimulationError:
             return
         seen.append(observe(engine, state, verlet_step))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from rigidmd.core.toml import parse_whole_number, plain_values, shorten_repr
 from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
-from rigidmd.run.provenance import NOT_COMPARED, differences, keys_of, plain, scene_digest
+from rigidmd.run.resume import NOT_COMPARED, differences, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.studies.sweep.folder import (
     FAILED,

@@ -18,8 +18,8 @@ from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder
-from rigidmd.run.checkpoints import checked_walltime
-from rigidmd.run.provenance import NOT_COMPARED, keys_of, plain
+from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
+from rigidmd.run.schedule import checked_walltime
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.base import default_name, read_tables

@@ -1,10 +1,53 @@
-"""When a run writes a checkpoint, and when it has to end. Wall time decides, and changes no bit of the results."""
+"""Segments of a run, when observers are called in them, when checkpoints are written, and when a run has to end.
+
+Wall time decides on checkpoints and the end, and changes no bit of the results.
+"""
 
 import time as clock
+from collections.abc import Callable, Collection
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
+from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.io.checkpoint import Checkpoint, write_checkpoint
+from rigidmd.run.observers import Observer, above_zero
+
+
+class Segment(NamedTuple):
+    """Equal steps (a stage, or the time between two breaks of a body), or an action in which no time passes."""
+
+    method: Scheme | Solver
+    dt: float  # ps, or s for a single body
+    steps: int
+    steps_before: int = 0  # in the same count of the intervals of observers
+    action: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
+
+
+class ObservationSchedule:
+    """When observers are called in a segment, in which steps are counted."""
+
+    def __init__(self, observers: Collection[Observer], segment: Segment):
+        self._observers, self._last = observers, segment.steps
+        self._regular: list[tuple[int, int]] = []  # steps between two calls of each, or 0; steps before the segment
+        for observer in observers:
+            if observer.interval is None:
+                self._regular.append((observer.steps or 0, 0))
+            else:  # may continue from the segment before
+                interval = above_zero(observer.interval, f"the interval of {type(observer).__name__}")
+                self._regular.append((max(1, round(interval / segment.dt)), segment.steps_before))
+
+    def next_observation(self, done: int) -> int:
+        """Number of steps at which the next observer is called, after `done` steps."""
+        return min([self._last, *(done + every - (before + done) % every for every, before in self._regular if every)])
+
+    def due(self, done: int) -> list[bool]:
+        """Which observers are called after `done` steps."""
+        return [
+            (observer.ends and done == self._last) or (every > 0 and (before + done) % every == 0)
+            for observer, (every, before) in zip(self._observers, self._regular, strict=True)
+        ]
+
 
 #: Seconds of computing after which the clock and signals are checked.
 SEGMENT_SECONDS = 1.0
