@@ -33,7 +33,7 @@ from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import is_estimate_cheap, stable_angle, stiffest_mode
+from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stable_angle, stiffest_mode
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment
@@ -269,7 +269,8 @@ class MolecularRun(RunPart):
         """Estimate the longest stable step (ps) of stage k at its start, and warn if its step is longer."""
         stage = self.scene.stages[k]
         evaluations = stage.steps * stage.scheme.force_evaluations
-        if not self.scene.watch.stable_step or not is_estimate_cheap(self.system, evaluations):
+        is_cheap = len(self.system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
+        if not self.scene.watch.stable_step or not is_cheap:
             return
         found = stiffest_mode(self.system, self.state, self.engine if self.engine.is_repeatable else None)
         if found is None:

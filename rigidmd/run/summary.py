@@ -291,22 +291,6 @@ def summarise_body(
     run, end = system.scene.run, float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
     angles = np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist() if system.rotates else None
-    return {
-        "interrupted": interrupted, "kind": system.kind, "pinned": not system.translates,
-        "degrees_of_freedom": system.degrees_of_freedom, "mass_kg": system.mass,
-        "inertia_kg_m2": system.inertia.tolist(), "integrator": run.integrator,
-        "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
-        "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
-        "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
-        "energy_start_J": float(motion["energy"][0]), "energy_end_J": float(motion["energy"][-1]),
-        "work_J": float(motion["work"][-1]),
-        "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
-        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
-        "theta_range_deg": angles, "trajectory_A_per_m": system.scale, "notes": _body_notes(system, motion),
-    }  # fmt: skip
-
-
-def _body_notes(system: BodySystem, motion: Motion) -> list[str]:
     notes = system.notes
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
         notes.append(
@@ -318,4 +302,16 @@ def _body_notes(system: BodySystem, motion: Motion) -> list[str]:
             notes.append(
                 "the body rotates by more than 180° between samples; shorten output.interval_s to follow its angles"
             )
-    return notes
+    return {
+        "interrupted": interrupted, "kind": system.kind, "pinned": not system.translates,
+        "degrees_of_freedom": system.degrees_of_freedom, "mass_kg": system.mass,
+        "inertia_kg_m2": system.inertia.tolist(), "integrator": run.integrator,
+        "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
+        "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
+        "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
+        "energy_start_J": float(motion["energy"][0]), "energy_end_J": float(motion["energy"][-1]),
+        "work_J": float(motion["work"][-1]),
+        "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
+        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
+        "theta_range_deg": angles, "trajectory_A_per_m": system.scale, "notes": notes,
+    }  # fmt: skip

@@ -79,11 +79,6 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
     inertia = np.sqrt(model.inverse_inertia[model.species[rotating]])
     radius = np.array([m.radius for m in system.species])[model.species[rotating], None]
 
-    def parts(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shifts and rotations of molecules along a mass-weighted vector."""
-        cut = 3 * len(moving)
-        return mass * vector[:cut].reshape(-1, 3), inertia * vector[cut:].reshape(-1, 3)
-
     def weighted(load: Load) -> np.ndarray:
         return np.concatenate([(mass * load.force[moving]).ravel(), (inertia * load.torque_body[rotating]).ravel()])
 
@@ -92,7 +87,8 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
     vector *= np.concatenate([np.repeat(mass, 3), inertia.ravel()]) > 0
     basis, matrix = [vector / sqrt(_product(vector, vector))], np.zeros((DIRECTIONS, DIRECTIONS))
     for k in range(DIRECTIONS):
-        shift, rotation = parts(basis[k])
+        shift, rotation = (part.reshape(-1, 3) for part in np.split(basis[k], [3 * len(moving)]))
+        shift, rotation = mass * shift, inertia * rotation
         reach = max(np.abs(shift).max(initial=0.0), np.abs(radius * rotation).max(initial=0.0))
         h = DISPLACEMENT * system.smallest_diameter / reach
         moved.position[moving] = state.position[moving] + h * shift
@@ -156,11 +152,6 @@ def step_warnings(scene: MolecularScene) -> list[str]:
                 f"{longest / FEMTOSECOND:.3g} fs where, as in liquids, the stiffest motions swing by {size:g} {unit}"
             )
     return warnings
-
-
-def is_estimate_cheap(system: System, evaluations: int) -> bool:
-    """Whether an estimate is cheap compared with the force evaluations of a stage."""
-    return len(system.model.species) <= SMALL_SYSTEM or evaluations >= 100 * DIRECTIONS
 
 
 def fastest_body_rate(system: BodySystem) -> float:
