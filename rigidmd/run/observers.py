@@ -36,9 +36,7 @@ class Moment:
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
         self._run, self._state = run, run.state
-        self.step = step
-        self.time = time
-        self.stage = stage
+        self.step, self.time, self.stage = step, time, stage
 
     def __repr__(self) -> str:
         return f"<Moment at time {self.time:g}, step {self.step}, stage {self.stage}>"
@@ -46,7 +44,10 @@ class Moment:
     @cached_property
     def state(self) -> State:
         """A copy of the state of the run, read-only."""
-        return State(*map(_read_only, self._state.copy()))
+        copy = self._state.copy()
+        for array in copy:
+            array.flags.writeable = False
+        return copy
 
     @cached_property
     def observation(self) -> Any:
@@ -63,11 +64,6 @@ class Moment:
     def site_positions(self) -> np.ndarray:
         """Positions (s, 3) of all sites, lab frame, Å, not wrapped."""
         return self._run.system.site_positions(self._state)
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
 
 
 def above_zero(interval: float, name: str) -> float:

@@ -102,10 +102,8 @@ class Results(Displayed):
             raise ValueError("this run wrote no trajectory (output.trajectory = false)")
         if self.files:
             by_name = {path.name: path for path in self.files}
-            times = [frame.time for frame in self._frames]
-            return trajectory.from_files(
-                self.system, by_name[not_none(output.topology)], by_name[output.trajectory], times
-            )
+            topology, times = by_name[not_none(output.topology)], [frame.time for frame in self._frames]
+            return trajectory.from_files(self.system, topology, by_name[output.trajectory], times)
         return trajectory.in_memory(self.system, self._frames)
 
     @overload

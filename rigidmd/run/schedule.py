@@ -74,10 +74,8 @@ class CheckpointSchedule:
 
     def __init__(self, folder: Path | None, minutes: float | bool, deadline: float | None):
         self._folder = folder if minutes is not False else None
-        self._seconds = 60.0 * minutes
-        self._deadline = deadline
-        self._last = clock.monotonic()
-        self._longest_write = 0.0
+        self._seconds, self._deadline = 60.0 * minutes, deadline
+        self._last, self._longest_write = clock.monotonic(), 0.0
         self._written: tuple[int, int, bool] | None = None
         self.requested = False
 

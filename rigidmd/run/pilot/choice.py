@@ -139,7 +139,7 @@ class _Search:
         self.time = system.span
         self.slow_factor: dict[str, float] = {}  # regular error in a longer pilot run over that in the short one
         self.measured: dict[str, Trial] = {}  # the last one of each integrator that has an error
-        self._tried: dict[tuple[str, float], Trial] = {}
+        self._tried: dict[tuple[str, float, float | None], Trial] = {}
 
     def best(self) -> Trial | None:
         """The trial with the fewest forces; None if no trial is within the target."""
@@ -174,13 +174,11 @@ class _Search:
         n = max(1, ceil(system.span / (timestep * system.time_size) * (1 - 1e-12)))
         if self.exact is not None:
             timestep = system.span / n / system.time_size
-        if span is None and (name, timestep) in self._tried:
-            return self._tried[name, timestep]
-        trial = Trial(name, timestep, n, n * system.methods[name].force_evaluations)
-        measure_errors(system, trial, self.exact)
-        if span is None:
-            self._tried[name, timestep] = trial
-        return trial
+        if (name, timestep, span) not in self._tried:
+            trial = Trial(name, timestep, n, n * system.methods[name].force_evaluations)
+            measure_errors(system, trial, self.exact)
+            self._tried[name, timestep, span] = trial
+        return self._tried[name, timestep, span]
 
     def step_for(self, trial: Trial) -> float:
         """The step at which the expected error is the target, by the order of the integrator."""
