@@ -102,8 +102,8 @@ class RigidMD(Calculator):
             elif given:
                 faults.append(f"{', '.join(given)}: set by the scene; change the scene")
             else:
-                given, self._user_forces = _tables(models), models.user_code.forces
-                models = [_entry(models, k) for k in range(len(models.molecules))]
+                self._user_forces = models.user_code.forces
+                models, given = _parts_of(models)
         if faults:
             raise SceneError("RigidMD", faults)
         self._models: Any = models
@@ -120,13 +120,12 @@ class RigidMD(Calculator):
         fitted = self._fit_atoms(not_none(self.atoms))
         if not self._warned and fitted.bent > self._bend:
             self._warned = True
-            warnings.warn(
+            message = (
                 f"an atom is {fitted.largest:.3f} Å from its position in a rigid molecule, {fitted.bent:.0%} of the "
                 "molecule's radius: energy and forces are computed for rigid molecules fitted to the atoms. make_rigid "
-                "corrects the atoms, minimise moves rigid molecules, ase.constraints.FixBondLengths keeps distances",
-                RigidMDWarning,
-                stacklevel=2,
+                "corrects the atoms, minimise moves rigid molecules, ase.constraints.FixBondLengths keeps distances"
             )
+            warnings.warn(message, RigidMDWarning, stacklevel=2)
         assembly, rotation = fitted.assembly, fitted.rotation
         found = ase_results(assembly.system, assembly.engine, fitted.state, self._form, fitted.atoms)
         forces = np.zeros((len(not_none(self.atoms)), 3))
@@ -168,17 +167,16 @@ class RigidMD(Calculator):
         """Rigid molecules fitted to the atoms, as matched before if this still fits."""
         if faults := atoms_errors(atoms):
             raise SceneError(SOURCE, faults)
-        if self._assembly is not None and self._assembly.applies_to(atoms):
-            fitted = self._assembly.fit(atoms)
-            if fitted.bent <= self._tolerance:
-                return fitted
-            try:
-                self._assembly = self._assemble(atoms, {})
-            except StructureError as error:
-                hint = "They matched before: keep the molecules rigid by constraints, or move them by RigidMD.minimise"
-                raise StructureError(SOURCE, [*error.errors, hint]) from None
-        else:
+        known = self._assembly if self._assembly is not None and self._assembly.applies_to(atoms) else None
+        if known is not None and (fitted := known.fit(atoms)).bent <= self._tolerance:
+            return fitted
+        try:
             self._assembly = self._assemble(atoms, {})
+        except StructureError as error:
+            if known is None:
+                raise
+            hint = "They matched before: keep the molecules rigid by constraints, or move them by RigidMD.minimise"
+            raise StructureError(SOURCE, [*error.errors, hint]) from None
         return self._assembly.fit(atoms)
 
     def _assemble(self, atoms: Atoms, stage_keys: Mapping[str, Any]) -> "_Assembly":
@@ -186,16 +184,14 @@ class RigidMD(Calculator):
         bare = atoms.copy()
         bare.set_constraint()
         bare.arrays.pop("momenta", None)
-        stages = [{"ensemble": "minimise", **stage_keys}]
-        structure = {"tolerance": self._tolerance}
-        scene = scene_from_atoms(bare, self._models, structure=structure, stages=stages, **self._settings)
+        tables: dict[str, Any] = {"structure": {"tolerance": self._tolerance}} | self._settings
+        scene = scene_from_atoms(bare, self._models, stages=[{"ensemble": "minimise", **stage_keys}], **tables)
         if self._user_forces:
             scene = scene.with_user_code(self._user_forces)
-        system = build(scene)
-        species = species_of(scene)
-        content = scene.embedded_files["structure.file"]
+        system, species = build(scene), species_of(scene)
+        read = read_atoms(Path(STRUCTURE), content=scene.embedded_files["structure.file"])
         cell = atoms.cell.array if atoms.pbc.all() else None
-        matched = match(read_atoms(Path(STRUCTURE), content=content), species, cell, self._tolerance)
+        matched = match(read, species, cell, self._tolerance)
         if isinstance(matched, list):
             raise StructureError(SOURCE, matched)
         basis = np.eye(3)
@@ -255,10 +251,9 @@ class _Assembly(NamedTuple):
 
     def applies_to(self, atoms: Atoms) -> bool:
         """Whether atoms have the elements and periodicity of the system, and a similar cell."""
-        if not (np.array_equal(atoms.numbers, self.numbers) and np.array_equal(atoms.pbc, self.pbc)):
-            return False
-        if not atoms.pbc.all():
-            return True
+        is_same = np.array_equal(atoms.numbers, self.numbers) and np.array_equal(atoms.pbc, self.pbc)
+        if not is_same or not atoms.pbc.all():
+            return is_same
         strain = np.linalg.solve(self.cell, atoms.cell.array) - np.eye(3)
         return bool(np.abs(strain).max() <= LARGEST_STRAIN)
 
@@ -271,10 +266,9 @@ class _Assembly(NamedTuple):
             rotation = second @ first
         position = atoms.positions @ rotation.T
         found = refit(position, self.matched, self.species, cell)
-        has_rotations = len(self.system.state.rotation) > 0
-        state = state_of(found.fit.centre, None, found.fit.rotation if has_rotations else None, None, cell)
-        given = position[self.order]
-        whole = given
+        rotations = found.fit.rotation if len(self.system.state.rotation) else None
+        state = state_of(found.fit.centre, None, rotations, None, cell)
+        whole = given = position[self.order]
         if cell is not None:
             whole = given - np.rint((given - self.rigid(state)) @ np.linalg.inv(cell)) @ cell
         radius = np.array([m.radius if len(massive_sites(m)) > 1 else np.inf for m in self.species])[found.species]
@@ -286,17 +280,15 @@ class _Assembly(NamedTuple):
         return self.system.site_positions(state)[self.system.sites.mass > 0]
 
 
-def _tables(scene: MolecularScene) -> dict[str, Any]:
-    """The tables of a scene that a calculator uses, with absolute paths."""
+def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The tables of the species of a scene without numbers of molecules, and the other tables that a calculator uses;
+    paths are absolute."""
     tables = scene.model_dump(exclude_defaults=True)
-    for force in tables.get("forces", {}).get("custom", ()):
-        if "module" in force:
-            force["module"] = str(scene.path(force["module"]).resolve())
-    return {key: tables[key] for key in TABLES if key in tables}
-
-
-def _entry(scene: MolecularScene, k: int) -> dict[str, Any]:
-    """The table of a species without a number of molecules, with absolute paths."""
-    table = scene.molecules[k].model_dump(exclude_defaults=True)
-    table.pop("count", None)
-    return table | {key: str(scene.path(table[key]).resolve()) for key in ("file", "parameters") if key in table}
+    paths = [*((table, key) for table in tables["molecules"] for key in ("file", "parameters"))]
+    paths += [(force, "module") for force in tables.get("forces", {}).get("custom", ())]
+    for table, key in paths:
+        if key in table:
+            table[key] = str(scene.path(table[key]).resolve())
+    for table in tables["molecules"]:
+        table.pop("count", None)
+    return list(tables["molecules"]), {key: tables[key] for key in TABLES if key in tables}

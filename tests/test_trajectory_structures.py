@@ -291,7 +291,7 @@ from functools import partial
 
 import numpy as np
 
-from PACKAGE.io.formats import Atoms, Format, Frame
+from PACKAGE.io.formats import Atoms, Format, Frame, register
 
 
 def encoder(system, interval, velocities):
@@ -325,7 +325,7 @@ def atoms_of(names, time, position, cell, velocity, step):
     return Atoms(names, [""] * len(names), [()] * len(names), np.array(position), np.array(velocity), np.array(cell))
 
 
-FORMATS = [Format((".toy",), read=read, encoder=encoder, reader=Reader, velocities=True, double=True)]
+register(Format((".toy",), read=read, encoder=encoder, reader=Reader, velocities=True, double=True))
 '''
 
 

@@ -18,7 +18,7 @@ from rigidmd.commands.streams import announce
 )  # fmt: skip
 def _gallery(options: argparse.Namespace) -> int:
     from rigidmd.io.write import check_target
-    from rigidmd.view.gallery import INDEX, selected_bodies, write_gallery
+    from rigidmd.view.run_page import INDEX, selected_bodies, write_gallery
 
     folder = Path(options.output)
     bodies = selected_bodies(options.names)

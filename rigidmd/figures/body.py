@@ -132,7 +132,11 @@ def _label_start(figure) -> None:
 def _angles_figure(columns: dict[str, np.ndarray]):
     """The Euler angles against time: φ and ψ continuous over full rotations, θ with at least a minimum span."""
     time, theta = columns["time"], np.degrees(columns["theta"])
-    phi, psi = _continuous_angles(columns)
+    phi, psi = columns["phi"].copy(), columns["psi"].copy()
+    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ is that of the next sample
+    for k in np.flatnonzero(np.sin(columns["theta"][:-1]) < 1e-12)[::-1]:
+        psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(columns["theta"][k]))
+        phi[k] = phi[k + 1]
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
     figure = _titled_figure("Euler angles (3-1-3)", 8, 6.4)
     beyond_turn = [np.ptp(angle) > 360 for angle in angles]
@@ -154,15 +158,6 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     if note:
         figure.supxlabel(note, fontsize=9, color=WARM, x=0.01, ha="left")
     return figure
-
-
-def _continuous_angles(columns: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """φ and ψ; at θ = 0 or 180°, where only their sum or difference is defined, with φ of the next sample."""
-    phi, psi, theta = (columns[key].copy() for key in ("phi", "psi", "theta"))
-    for k in np.flatnonzero(np.sin(theta[:-1]) < 1e-12)[::-1]:
-        psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(theta[k]))
-        phi[k] = phi[k + 1]
-    return phi, psi
 
 
 def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):

@@ -31,21 +31,18 @@ def check_folder(
         exists = folder.exists()
     except OSError as error:  # a name that is too long
         raise OutputError(f"{shorten_text(str(folder))} cannot be written: {error.strerror}") from None
-    if exists:
-        if not folder.is_dir():
-            raise OutputError(f"{folder} is a file; name another folder with -o")
-        if not is_empty(folder):
-            if not (folder / marker).is_file():
-                raise OutputError(f"{folder} is not empty and holds no earlier {what}; name another folder with -o")
-            if not force:
-                resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
-                hint = f"{resume}--force replaces it, -o names another folder"
-                raise OutputError(f"{folder} holds an earlier {what}; {hint}")
-            replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}
-            if used := [path for path in inputs if path.resolve() in replaced]:
-                problem = f"{used[0]} is an input of this run and would be replaced"
-                raise OutputError(f"{problem}; name another folder with -o")
-            check_names(folder, names, marker)
+    if exists and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name another folder with -o")
+    if not is_empty(folder):
+        if not (folder / marker).is_file():
+            raise OutputError(f"{folder} is not empty and holds no earlier {what}; name another folder with -o")
+        if not force:
+            resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
+            raise OutputError(f"{folder} holds an earlier {what}; {resume}--force replaces it, -o names another folder")
+        replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}
+        if used := [path for path in inputs if path.resolve() in replaced]:
+            raise OutputError(f"{used[0]} is an input of this run and would be replaced; name another folder with -o")
+        check_names(folder, names, marker)
     parent = folder
     while not parent.exists():
         parent = parent.parent

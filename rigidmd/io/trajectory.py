@@ -40,7 +40,7 @@ def universe(system: System | BodySystem, state: State, wrapped: bool = True) ->
     """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this state."""
     u = universe_of(system)
     _connect(u, system, massless=False)  # viewers would draw these bonds
-    set_frame(u, Frame(0.0, system.site_positions(state, wrapped), state.cell))
+    set_frame(u.trajectory.ts, Frame(0.0, system.site_positions(state, wrapped), state.cell))
     return u
 
 
@@ -57,8 +57,7 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
     u = universe(system, system.state)
     _connect(u, system)
     times, positions = _checked([frame.time for frame in frames]), np.array([frame.positions for frame in frames])
-    boxes = [dimensions(frame.cell) for frame in frames if frame.cell is not None]
-    boxes = None if u.dimensions is None else np.array(boxes)
+    boxes = None if u.dimensions is None else np.array([dimensions(frame.cell) for frame in frames])
     velocities = np.array([frame.velocities for frame in frames])
     u.trajectory = timed(MemoryReader)(positions, times=times, order="fac", dimensions=boxes, velocities=velocities)
     return u
@@ -220,11 +219,7 @@ class SiteReader(ReaderBase):
         if len(found.positions) != self.n_atoms:
             raise ValueError(f"frame {i + 1} has another number of sites")
         self._frame = self.ts.frame = i
-        self.ts.positions = found.positions
-        if found.velocities is not None:
-            self.ts.velocities = found.velocities
-        self.ts.dimensions = None if found.cell is None else dimensions(found.cell)
-        self.ts.time, self.ts.data["step"] = found.time, found.step
+        set_frame(self.ts, found)
         return self.ts
 
     def _read_next_timestep(self, ts=None):

@@ -43,10 +43,10 @@ def default_name() -> str:
 def check_writer(path: Path) -> None:
     """Raise OutputError if a file of this format cannot be written on this machine."""
     if path.suffix == ".mp4" and ffmpeg() is None:
-        raise OutputError(
-            f"{path}: .mp4 needs ffmpeg: install the program, or `pip install imageio-ffmpeg`, which contains it; "
-            "a .gif needs no other program"
+        advice = (
+            "install the program, or `pip install imageio-ffmpeg`, which contains it; a .gif needs no other program"
         )
+        raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}")
 
 
 def write_film(

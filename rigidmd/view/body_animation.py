@@ -73,11 +73,8 @@ class BodyAnimation:
                 self.notes.append(f"The body is drawn {enlarged:.3g} times as large as it is relative to its path.")
         else:
             self.unit, self.position = 1.08 * radius, np.zeros_like(position)
-            path = (
-                radius
-                / self.unit
-                * np.stack([sum(of(f"q{i}{j + 1}")[:, 0] * self.axis[j] for j in range(3)) for i in (1, 2, 3)], axis=-1)
-            )
+            turned = [sum(seen[f"q{i}{j + 1}"][rows] * self.axis[j] for j in range(3)) for i in (1, 2, 3)]
+            path = radius / self.unit * np.stack(turned, axis=-1)
         self.sphere = 0.0 if moves else radius / self.unit
         self.quaternion = of("qw", "qx", "qy", "qz") if turns else np.tile([1.0, 0, 0, 0], (len(rows), 1))
         shown = thin_path(path, MOST_POINTS)
@@ -204,12 +201,9 @@ class BodyAnimation:
             return []
         size = np.linalg.norm([self._record.columns[f"omega_lab_{k}"] for k in "xyz"], axis=0)
         turns = float(size.max() * interval / (2 * np.pi))
-        if turns <= MAX_ROTATION:
-            return []
-        return [
-            f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to stand or to rotate "
-            f"backwards: an animation of {seconds * turns / MAX_ROTATION:.3g} s shows its rotation."
-        ]
+        note = f"The body rotates up to {turns:.2g} times between two frames, so that it may seem to stand or to rotate"
+        note += f" backwards: an animation of {seconds * turns / MAX_ROTATION:.3g} s shows its rotation."
+        return [note] if turns > MAX_ROTATION else []
 
     def page_part(self) -> PagePart:
         data = {
@@ -224,10 +218,9 @@ class BodyAnimation:
         chips = [(VECTORS[name][2], f"{VECTORS[name][3]}, at most {most}") for name, most in self.largest.items()]
         chips += [] if self.gravity is None else [("var(--ink)", "gravity g")]
         trace = "path of the centre of mass" if not self.sphere else "path of the body axis on the sphere"
-        legend = "".join(
-            f'<span><i class="chip" style="background:{color}"></i>{html.escape(text)}</span>'
-            for color, text in (*chips, ("var(--cool)", trace))
-        )
+        chips.append(("var(--cool)", trace))
+        chip = '<span><i class="chip" style="background:{}"></i>{}</span>'
+        legend = "".join(chip.format(color, html.escape(text)) for color, text in chips)
         usage = "Drag to rotate, wheel or pinch to zoom, double click to reset; space plays."
         usage += " A click on a plot jumps to it."
         picture = '<canvas id="film" role="img" aria-label="film of the body"></canvas>'

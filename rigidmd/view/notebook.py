@@ -91,10 +91,9 @@ def _framed(name: str, about: str, body: str) -> str:
 
 def _table(rows: Iterable[TableRow]) -> str:
     """A table in which equal names in successive rows appear once."""
-    text, before = [], ""
-    for name, value in rows:
-        text.append(("" if name == before else name, value))
-        before = name
+    rows = list(rows)
+    before = ["", *(name for name, _ in rows)]
+    text = [("" if name == last else name, value) for last, (name, value) in zip(before, rows, strict=False)]
     return table([], text, words=True)
 
 

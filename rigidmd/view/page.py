@@ -33,14 +33,16 @@ class PagePart(NamedTuple):
 
 def page(title: str, parts: Iterable[str], head: str = "") -> str:
     """A whole page of HTML parts under a title (plain text). `head` is added to its head: more style or scripts."""
-    title_html = html.escape(title)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{title_html}</title>\n<style>{STYLE}</style>{head}</head>\n<body>\n<h1>{title_html}</h1>\n"
-        + "\n".join(part for part in parts if part)
-        + "\n</body></html>\n"
-    )
+    title_html, body = html.escape(title), "\n".join(part for part in parts if part)
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">\
+<title>{title_html}</title>
+<style>{STYLE}</style>{head}</head>
+<body>
+<h1>{title_html}</h1>
+{body}
+</body></html>
+"""
 
 
 def write_page(path: Path, make: Callable[[], str]) -> None:
@@ -64,9 +66,8 @@ def table(
     the first column -> what is shown instead, such as one of `chips`"""
     head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
     kind = ' class="words"' if words else ""
-    body = "".join(
-        f"<tr>{_cell(marked.get(str(first), first))}{''.join(map(_cell, rest))}</tr>\n" for first, *rest in rows
-    )
+    cells = [[_cell(marked.get(str(first), first)), *map(_cell, rest)] for first, *rest in rows]
+    body = "".join(f"<tr>{''.join(line)}</tr>\n" for line in cells)
     top = f"<thead><tr>{head}</tr></thead>" if titles else ""
     return f'<div class="scroll"><table{kind}>{top}<tbody>\n{body}</tbody></table></div>' if body else ""
 
@@ -89,10 +90,8 @@ def plain(value: object) -> str:
 
 def chips(names: Iterable[str]) -> dict[str, Raw]:
     """Names with the colours of their curves, as cells."""
-    return {
-        name: Raw(f'<span style="color:{curve_style(k)["color"]}">■</span> {plain(name)}')
-        for k, name in enumerate(names)
-    }
+    mark = '<span style="color:{}">■</span> {}'
+    return {name: Raw(mark.format(curve_style(k)["color"], plain(name))) for k, name in enumerate(names)}
 
 
 def items(lines: Iterable[object]) -> str:

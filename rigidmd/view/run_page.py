@@ -5,9 +5,10 @@ Chemiscope, whose JavaScript is in the page, draws the animation of molecules.
 
 import base64
 import html
+import io
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,15 @@ import numpy as np
 from rigidmd.analysis.files import curve_figure, read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
+from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
+from rigidmd.errors import InputError
+from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
+from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
+from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation
 from rigidmd.view.molecule_animation import MoleculeAnimation
@@ -75,9 +81,11 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
         yield section("Plots", plots.plots_part(record))
     yield section("Analyses", *_analyses(record))
     yield section("Stability margins", _margins(record))
-    simulated, left_out = _scene_description(record)
-    yield section("What was simulated", code(simulated))
-    yield section("What was left out, and why", items(left_out))
+    lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
+    start = lines.index("left out:") if "left out:" in lines else len(lines)
+    end = next((k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines))
+    yield section("What was simulated", code("\n".join([*lines[:start], *lines[end:]])))
+    yield section("What was left out, and why", items(line.strip() for line in lines[start + 1 : end]))
     yield section("Files", _files(record))
     yield section("How to repeat it", *_repeat(record))
 
@@ -189,16 +197,6 @@ def _margins(record: Record) -> str:
 MARGINS = ((0.5, GOOD, "safe"), (1.0, DOUBTFUL, "near the limit"), (float("inf"), BAD, "too long"))
 
 
-def _scene_description(record: Record) -> tuple[str, list[str]]:
-    """The output of `rigidmd check`: the description of the scene, and what is left out."""
-    lines = describe(record.scene, user_code=False).splitlines()
-    if "left out:" not in lines:
-        return "\n".join(lines), []
-    start = lines.index("left out:")
-    end = next((k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines))
-    return "\n".join([*lines[:start], *lines[end:]]), [line.strip() for line in lines[start + 1 : end]]
-
-
 def _files(record: Record) -> str:
     output, rows = record.scene.output, []
     about = ABOUT | {output.topology: "names and first positions, for viewers"}
@@ -228,13 +226,14 @@ def _repeat(record: Record) -> Iterator[str]:
         f"rigidmd run {folder}/{SCENE} -o {folder}-again    # the same run\n"
         f"rigidmd compare {folder} {folder}-again    # to the same bits"
     )
-    rows = [[name, value] for key, name in PROVENANCE if (value := summary.get(key))]
-    for row in rows:
-        if isinstance(row[1], dict):
-            row[1] = ", ".join(f"{key} {digest}" for key, digest in row[1].items())
+    rows = []
+    for key, name in PROVENANCE:
+        if isinstance(value := summary.get(key), dict):
+            value = ", ".join(f"{path} {digest}" for path, digest in value.items())
+        rows += [[name, value]] if value else []
     yield table([], rows, words=True)
-    seconds = [f"{summary[key]:.1f} s {word}" for key, word in (("preparing_s", "to compile and prepare"),
-               ("computing_s", "of steps"), ("wall_s", "in all, output included")) if summary.get(key)]  # fmt: skip
+    about = {"preparing_s": "to compile and prepare", "computing_s": "of steps", "wall_s": "in all, output included"}
+    seconds = [f"{summary[key]:.1f} s {phase}" for key, phase in about.items() if summary.get(key)]
     yield f"<p>{html.escape('; '.join(seconds))}.</p>" if seconds else ""
 
 
@@ -280,3 +279,53 @@ def animation_parts(record: Record, animation: BodyAnimation | MoleculeAnimation
         f'<script type="application/json" id="film-data">{data}</script>',
         *(f"<script>{text}</script>" for text in part.scripts),
     ]
+
+
+INDEX = "index.html"
+#: The default bodies.
+SHOWN = (
+    *(f"heavy_top_{k}" for k in range(1, 8)), "intermediate_axis", "sleeping_top", "gyrocompass", "dropped_stone",
+)  # fmt: skip
+#: Inches and dots per inch of a picture, and the fraction of the run that has passed in it.
+INCHES, DPI, RUN_FRACTION = 3.2, 100, 0.62
+STYLE = """<style>.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
+.cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;padding:.6rem;display:block}
+.cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}</style>"""
+
+
+def selected_bodies(names: list[str]) -> list[Example]:
+    """The shipped bodies with these names, or those of SHOWN. Raises RigidMDError."""
+    bodies = {example.name: example for example in examples() if example.is_body}
+    if unknown := [name for name in names if name not in bodies]:
+        raise InputError("gallery", [f"unknown body {unknown[0]!r}; shipped are {', '.join(bodies)}"])
+    return [bodies[name] for name in names or SHOWN]
+
+
+def write_gallery(
+    folder: Path, names: list[str], force: bool, command: str, progress: Callable[[str], object] = lambda name: None
+) -> Path:
+    """Run bodies into folder/runs, write their pages and an index. Returns the path of the index. Raises OutputError.
+
+    progress : called with the name of each body before it runs
+    """
+    cards = []
+    for example in selected_bodies(names):
+        progress(example.name)
+        scene = Scene.read(example.path, {"output.figures": False, "output.trajectory": False})
+        run = folder / "runs" / example.name
+        Simulation(scene, run, force).run()
+        target, _ = write_view(run, folder / f"{example.name}.html")
+        animation, stream = BodyAnimation(read_record(run)), io.BytesIO()
+        figure = new_figure(INCHES, INCHES, layout=None, dpi=DPI)
+        begin, end = animation.time[[0, -1]]
+        animation.draw(figure.add_axes((0, 0, 1, 1)), float(begin + RUN_FRACTION * (end - begin)))
+        save_figure(figure, stream, format="png", dpi=DPI)
+        picture = base64.b64encode(stream.getvalue()).decode()
+        cards.append(
+            f'<a href="{target.name}"><img alt="" src="data:image/png;base64,{picture}">'
+            f"<b>{html.escape(example.name)}</b><span>{html.escape(example.about)}</span></a>"
+        )
+    about = '<p class="faint">Each picture links to the animation of the body.</p>'
+    index = [about, f'<div class="cards">{"".join(cards)}</div>', code(command)]
+    write_text(folder / INDEX, page("Tops, gyroscopes and a stone", index, STYLE))
+    return folder / INDEX

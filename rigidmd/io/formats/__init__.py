@@ -1,4 +1,4 @@
-"""File formats of structures and trajectories: each module here with `FORMATS` states everything about its formats.
+"""File formats of structures and trajectories: a module here registers its formats, and states everything about them.
 
 No other code of rigidmd names an extension. A module in this folder is found by being there; `register` adds a format
 from outside.
@@ -20,6 +20,7 @@ from rigidmd.io.formats.atoms import Atoms, Frame
 #: `residue_names`, `site_positions(state, wrapped)`, `site_velocities(state)`. Those of molecules also have `species`,
 #: a `scene.models.Molecule` of each kind, `model.species`, `of_sites(function)` and `centres(state, wrapped)`.
 System = Any
+Encode = Callable[[Frame, int], bytes]
 
 
 class Format(NamedTuple):
@@ -43,7 +44,7 @@ class Format(NamedTuple):
     # frame and its index k that returns the bytes to append, for k = 0 with the head of the file. `counter` is the
     # position and the `struct` format of the number of frames in the file. `writer` is a class for all other formats of
     # molecules, see `frame_file.FrameFile`.
-    encoder: Callable[[Any, float, bool], Callable[[Frame, int], bytes]] | None = None
+    encoder: Callable[[Any, float, bool], Encode] | None = None
     counter: tuple[int, str] = (0, "")
     writer: Callable[..., Any] | None = None
     # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only OSError and ValueError.
@@ -91,10 +92,9 @@ def register(form: Format) -> None:
 
 
 def find_modules() -> None:
-    """Register the formats of all modules in the folders of this package."""
+    """Import all modules in the folders of this package, which register their formats."""
     for module in iter_modules(__path__, f"{__name__}."):
-        for form in getattr(import_module(module.name), "FORMATS", ()):
-            register(form)
+        import_module(module.name)
 
 
 def format_of(path: str | Path) -> Format | None:

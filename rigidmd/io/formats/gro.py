@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format
+from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
 
 
@@ -66,10 +66,8 @@ def _gro_frame(path: Path, lines: list[str], first: int, box: int, edges: list[f
     return Atoms(names, [""] * len(names), residue, 10 * position, moving, cell)
 
 
-FORMATS = [
-    Format(
-        (".gro",), read=read_gro, write_topology=lambda path, sites: sites.write(str(path)),
-        limits=(-9999.9, 99999.9),  # columns of eight
-        content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
-    ),
-]  # fmt: skip
+register(Format(
+    (".gro",), read=read_gro, write_topology=lambda path, sites: sites.write(str(path)),
+    limits=(-9999.9, 99999.9),  # columns of eight
+    content=re.compile(r"\A(?:[ \t]*\n)*.*\n[ \t]*\d+[ \t]*\n.{20}( *-?\d+\.\d+){3}"),
+))  # fmt: skip

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format, System
+from rigidmd.io.formats import Format, System, register
 from rigidmd.io.formats.atoms import Atoms, Frame, structure_error
 from rigidmd.io.formats.bonds import charges, connections
 from rigidmd.io.formats.frame_file import FrameFile
@@ -314,9 +314,7 @@ def read_frame(path: Path, frame: int) -> Atoms:
     )  # fmt: skip
 
 
-FORMATS = [
-    Format(
-        (".gsd",), read_frame=read_frame, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
-        viewer="ovito {trajectory}",
-    ),
-]  # fmt: skip
+register(Format(
+    (".gsd",), read_frame=read_frame, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
+    viewer="ovito {trajectory}",
+))  # fmt: skip

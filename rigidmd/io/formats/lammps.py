@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
-from rigidmd.io.formats import Format
+from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
@@ -312,13 +312,11 @@ def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: f
     return low, cell
 
 
-FORMATS = [
-    Format(
-        (".data", ".lmp", ".lammps"), "data files of LAMMPS (.data)", read=read_data, has_types=True,
-        content=re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE),
-    ),
-    Format(
-        (), "dumps of LAMMPS", read=read_dump, has_types=True,
-        content=re.compile(r"\A\s*ITEM: (TIMESTEP|UNITS|TIME)\b"),
-    ),
-]  # fmt: skip
+register(Format(
+    (".data", ".lmp", ".lammps"), "data files of LAMMPS (.data)", read=read_data, has_types=True,
+    content=re.compile(r"^[ \t]*\d+[ \t]+atoms[ \t]*(#.*)?$", re.MULTILINE),
+))  # fmt: skip
+register(Format(
+    (), "dumps of LAMMPS", read=read_dump, has_types=True,
+    content=re.compile(r"\A\s*ITEM: (TIMESTEP|UNITS|TIME)\b"),
+))  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.io.formats import Format, System
+from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, numbers, structure_error, unexpected
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
@@ -91,7 +91,7 @@ def _pdb_columns(path: Path, number: int, line: str) -> tuple[str, int, list[flo
     return straight, found.end(), numbers(path, number, list(found.groups()), "three coordinates")
 
 
-def encoder(system: System, interval: float, velocities: bool) -> Callable[[Frame, int], bytes]:
+def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Models, each with its time in a remark and its box before it; bonds are in the topology."""
     files = FrameFiles(system, velocities, "PDB", {"multiframe": True, "bonds": None})
 
@@ -112,11 +112,9 @@ def encoder(system: System, interval: float, velocities: bool) -> Callable[[Fram
     return encode
 
 
-FORMATS = [
-    Format(
-        (".pdb", ".ent"), read=read_pdb, encoder=encoder, times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
-        content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
-        write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
-        limits=(-999.99, 9999.99),  # columns of eight
-    ),
-]  # fmt: skip
+register(Format(
+    (".pdb", ".ent"), read=read_pdb, encoder=encoder, times=re.compile(rb"^REMARK +()TIME +(\S+) PS"),
+    content=re.compile(r"^(ATOM  |HETATM).{24}( *-?\d+\.\d{3}){3}", re.MULTILINE),
+    write_topology=lambda path, sites: sites.write(str(path), bonds="all"),
+    limits=(-999.99, 9999.99),  # columns of eight
+))  # fmt: skip

@@ -42,13 +42,12 @@ def universe_of(system: System, velocities: bool = False) -> Any:
     return u
 
 
-def set_frame(u: Any, frame: Frame) -> None:
-    now = u.trajectory.ts
-    now.positions = frame.positions
+def set_frame(timestep: Any, frame: Frame) -> None:
+    timestep.positions = frame.positions
     if frame.velocities is not None:
-        now.velocities = frame.velocities
-    now.dimensions = dimensions(frame.cell)
-    now.time, now.data["step"] = frame.time, frame.step
+        timestep.velocities = frame.velocities
+    timestep.dimensions = dimensions(frame.cell)
+    timestep.time, timestep.data["step"] = frame.time, frame.step
 
 
 class FrameFiles:
@@ -62,7 +61,7 @@ class FrameFiles:
         """`write(writer, atoms)` is called in place of `writer.write(atoms)`."""
         import MDAnalysis as mda
 
-        set_frame(self._universe, frame)
+        set_frame(self._universe.trajectory.ts, frame)
         with scratch_file() as path, ignore_warnings():
             writer: Any = mda.Writer(path, n_atoms=self.sites, format=self._name, **self._options, **options)
             with writer:

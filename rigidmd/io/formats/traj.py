@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.io.formats import Format, System
+from rigidmd.io.formats import Format, System, register
 from rigidmd.io.formats.atoms import Atoms, Frame
 from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.io.formats.through_ase import ASE_VELOCITY, atoms_of_sites, from_ase, read_by_ase
@@ -188,9 +188,7 @@ def read_packed(path: Path, source: Path) -> list[Callable[[], Atoms]]:
     return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
 
 
-FORMATS = [
-    Format(
-        (".traj",), read_packed=read_packed, writer=TrajFile, reader=TrajReader, velocities=True, double=True,
-        viewer="ase gui {trajectory}",
-    ),
-]  # fmt: skip
+register(Format(
+    (".traj",), read_packed=read_packed, writer=TrajFile, reader=TrajReader, velocities=True, double=True,
+    viewer="ase gui {trajectory}",
+))  # fmt: skip

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.io.formats import Format, System
+from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import (
     HEAVY_HYDROGEN,
     Atoms,
@@ -94,7 +94,7 @@ def _columns(properties: str) -> tuple[int | None, int | None, int]:
     return found.get("species"), found.get("pos"), column
 
 
-def encoder(system: System, interval: float, velocities: bool) -> Callable[[Frame, int], bytes]:
+def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Extended XYZ, for OVITO and ASE: box and time are in the comment line."""
     files = FrameFiles(system, velocities, "XYZ")
 
@@ -112,10 +112,8 @@ def encoder(system: System, interval: float, velocities: bool) -> Callable[[Fram
     return encode
 
 
-FORMATS = [
-    Format(
-        (".xyz", ".extxyz"), read=read_xyz, has_types=True, encoder=encoder,
-        content=re.compile(r"\A\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"),
-        times=re.compile(rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)'),
-    ),
-]  # fmt: skip
+register(Format(
+    (".xyz", ".extxyz"), read=read_xyz, has_types=True, encoder=encoder,
+    content=re.compile(r"\A\s*\d+[ \t]*\n.*\n[ \t]*[A-Za-z]\w*([ \t]+-?\d*\.?\d+){3}"),
+    times=re.compile(rb'(?:Lattice="([^"]*)" )?pbc=.* Time=(\S+)'),
+))  # fmt: skip
