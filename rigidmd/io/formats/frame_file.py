@@ -2,8 +2,7 @@
 
 import contextlib
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from rigidmd.errors import OutputError
 from rigidmd.io.formats import System
 
 
-class FrameFile(ABC):
+class FrameFile:
     """Writes frames to a file, each to the disk at once. For the arguments see `io.trajectory.TrajectoryFile`.
 
     The table of frames moves within a growing file. So a resumed run copies the frames up to the checkpoint to a new
@@ -23,6 +22,13 @@ class FrameFile(ABC):
 
     Raises OutputError, here and in every method.
     """
+
+    # A format implements these methods.
+    _open: Callable[[Path, str], Any]  # the file of the library, to write "w" or to append "a"
+    _frame: Callable[[State, float, int], Any]  # the frame of a state, as `_append` takes it
+    _append: Callable[[Any, Any], None]  # (file, frame)
+    _arrays: Callable[[Any], Iterable[np.ndarray]]  # of a frame, for the checksum
+    _stored_frames: Callable[[int], Iterator[Any]]  # the first of the file; raises as `_kept_frames` catches
 
     def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
         self._path, self._system = path, system
@@ -94,25 +100,6 @@ class FrameFile(ABC):
             yield
         except (OSError, RuntimeError) as error:
             raise OutputError(f"{self._path} cannot be written: {_reason(error)}") from None
-
-    @abstractmethod
-    def _open(self, path: Path, mode: str) -> Any:
-        """The file of the library, to write "w" or to append "a"."""
-
-    @abstractmethod
-    def _frame(self, state: State, time: float, step: int) -> Any:
-        """The frame of a state, as the library or `_append` takes it."""
-
-    @abstractmethod
-    def _append(self, file: Any, frame: Any) -> None: ...
-
-    @abstractmethod
-    def _arrays(self, frame: Any) -> Iterable[np.ndarray]:
-        """The arrays of a frame, for the checksum."""
-
-    @abstractmethod
-    def _stored_frames(self, count: int) -> Iterator[Any]:
-        """The first frames of the file. Raises ValueError, RuntimeError, KeyError or OSError."""
 
 
 def _reason(error: Exception) -> str:
