@@ -9,7 +9,7 @@ from rigidmd.core.state import NO_CELL
 from rigidmd.engines.samples import moving
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
-from rigidmd.io.log import TENSOR_FILE, read_tensor
+from rigidmd.io.run_files import TENSOR_FILE, read_tensor
 from rigidmd.io.trajectory import Frames, read_frames
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results

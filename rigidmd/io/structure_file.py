@@ -109,15 +109,15 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
     """Names, elements, masses (s,) and positions (s, 3) of the atoms of a file with one molecule."""
     from ase.data import atomic_masses, atomic_numbers
 
-    def mass(element: str) -> float:
-        return HEAVY_HYDROGEN[element] if element in HEAVY_HYDROGEN else float(atomic_masses[atomic_numbers[element]])
-
     if (form := format_of(path)) is not None and form.is_trajectory:
         raise structure_error(path, "is a trajectory: name a structure file, or write a frame of it as one")
     atoms = read_atoms(path)
     elements = [e or element_of(name) or "X" for e, name in zip(atoms.elements, atoms.names, strict=True)]
-    masses = np.array([mass(e) if e != "X" else 0.0 for e in elements])
-    return atoms.names, elements, masses if atoms.masses is None else atoms.masses, atoms.position
+    masses = atoms.masses
+    if masses is None:
+        known = {"X": 0.0} | HEAVY_HYDROGEN
+        masses = np.array([known[e] if e in known else atomic_masses[atomic_numbers[e]] for e in elements])
+    return atoms.names, elements, masses, atoms.position
 
 
 def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) -> Callable[[], Atoms]:
@@ -125,10 +125,8 @@ def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) ->
         frame = -1
     if frame is None:
         if len(frames) > 1:
-            hint = f"structure.frame (1 to {len(frames)}, -1 for the last)"
-            raise structure_error(
-                path, f"holds {len(frames)} structures: keep one, or for a start select one by {hint}"
-            )
+            hint = f"keep one, or for a start select one by structure.frame (1 to {len(frames)}, -1 for the last)"
+            raise structure_error(path, f"holds {len(frames)} structures: {hint}")
         frame = 1
     if not frames:
         raise structure_error(path, "holds no atoms")
@@ -147,9 +145,8 @@ def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if not text.strip():
         raise structure_error(path, "holds no atoms: it is empty")
-    form = format_of(name) or next(
-        (form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING])), None
-    )
+    recognised = (form for form in BY_CONTENT if form.content and form.content.search(text[:BEGINNING]))
+    form = format_of(name) or next(recognised, None)
     if atom_types is not None and not (form and form.has_types):
         raise structure_error(path, _no_types())
     if form is not None and form.read is not None:

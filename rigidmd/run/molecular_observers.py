@@ -13,7 +13,7 @@ from rigidmd.figures.run import run_figures
 from rigidmd.figures.style import save_figure
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
-from rigidmd.io.log import TENSOR_FILE, Log, TensorFile, tensor_row
+from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.scene.stage import Stage

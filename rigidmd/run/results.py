@@ -84,7 +84,7 @@ class Results(Displayed):
             import pandas
         except ImportError:
             raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
-        from rigidmd.io.log import TENSOR
+        from rigidmd.io.run_files import TENSOR
 
         left_out = () if getattr(self.system.scene.output, "pressure_tensor", True) else TENSOR
         return pandas.DataFrame(self.samples.written).drop(columns=[self.samples.described[n].header for n in left_out])
