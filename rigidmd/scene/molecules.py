@@ -102,7 +102,7 @@ class Output(Section):
     @field_validator("trajectory")
     @classmethod
     def _trajectory_name(cls, name):
-        return name if name is False else file_name(name, written(lambda form: form.is_written))
+        return name if name is False else file_name(name, written(lambda form: form.encoder or form.writer))
 
     @field_validator("topology")
     @classmethod

@@ -67,10 +67,6 @@ class Format(NamedTuple):
         """Whether single frames are read of it as structures."""
         return self.read_frame is not None or self.read_arrays is not None
 
-    @property
-    def is_written(self) -> bool:
-        return self.encoder is not None or self.writer is not None
-
     def exceeded(self, positions: np.ndarray) -> float | None:
         """The limit, Å, beyond which a position (s, 3) is; None if the format can hold all of them."""
         least, largest = self.limits

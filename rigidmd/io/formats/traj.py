@@ -81,13 +81,11 @@ class TrajReader:
             info: Any = item.get("info") or {}
             if cell.shape != (3, 3):
                 raise ValueError("it is damaged: a cell is not of shape (3, 3)")
-            atoms = len(self._atoms)
-            counts = {"momenta": atoms, MASSLESS: self.sites - atoms, MASSLESS_VELOCITY: self.sites - atoms}
-            there = [self._array(item, name, (n, 3)) if name in item else None for name, n in counts.items()]
-            return Stored(
-                self._array(item, "positions", (atoms, 3)), there[0], there[1], there[2],
-                cell if cell.any() else None, float(info["time_ps"]), int(info["step"]),
-            )  # fmt: skip
+            n, m = len(self._atoms), self.sites - len(self._atoms)
+            wanted = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
+            there = {name for name in wanted if name == "positions" or name in item}
+            arrays = [self._array(item, name, (size, 3)) if name in there else None for name, size in wanted.items()]
+            return Stored._make([*arrays, cell if cell.any() else None, float(info["time_ps"]), int(info["step"])])
         except DAMAGE as error:
             raise ValueError(f"frame {k + 1} is damaged: {error}") from None
 
