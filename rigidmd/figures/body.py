@@ -81,13 +81,6 @@ def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
     return figures
 
 
-def _titled_figure(title: str, width: float, height: float):
-    """An empty figure, to whose title `body_figures` adds the name of the run."""
-    figure = new_figure(width, height)
-    figure.suptitle(title)
-    return figure
-
-
 def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np.ndarray | None):
     """The body axis on the unit sphere and seen along z, enlarged if it stays in a small part of the disc."""
     path = np.stack([sum(columns[f"q{i}{j}"] * axis_body[j - 1] for j in (1, 2, 3)) for i in (1, 2, 3)], axis=-1)
@@ -95,7 +88,7 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     side, word = (1.0, "above") if path[:, 2].mean() > -1e-9 else (-1.0, "below")
     azimuth, lift = np.arctan2(path[0, 1], path[0, 0]) - np.radians(25), side * np.radians(25)
     eye = np.array([np.cos(azimuth) * np.cos(lift), np.sin(azimuth) * np.cos(lift), np.sin(lift)])
-    sphere, disc = (figure := _titled_figure("path of the body axis", 10, 5.4)).subplots(1, 2)
+    sphere, disc = (figure := new_figure(10, 5.4, title="path of the body axis")).subplots(1, 2)
     view, half = camera(eye, UP), np.full(2, 1.12)
     _shade(sphere, [(np.ones(3), FAINT)], view, half, np.zeros(2))
     for ring in globe():
@@ -138,7 +131,7 @@ def _angles_figure(columns: dict[str, np.ndarray]):
         psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(columns["theta"][k]))
         phi[k] = phi[k + 1]
     angles = [np.degrees(np.unwrap(phi)), theta, np.degrees(np.unwrap(psi))]
-    figure = _titled_figure("Euler angles (3-1-3)", 8, 6.4)
+    figure = new_figure(8, 6.4, title="Euler angles (3-1-3)")
     beyond_turn = [np.ptp(angle) > 360 for angle in angles]
     drawn = [angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)]
     labels = [f"{name} ({'text' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
@@ -180,7 +173,7 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
     boxes = [(half, np.zeros(2), f"from the side of ω; energy (blue), momentum (red), t = {time[at]:g} s")]
     if 1e-6 * half.max() < near < 0.2 * half.max():
         boxes.append((np.full(2, near), middle, f"the path, enlarged {_enlargement(half.max() / near)}"))
-    figure = _titled_figure("ω in the body frame", 6.2 + 4 * len(boxes), 5)
+    figure = new_figure(6.2 + 4 * len(boxes), 5, title="ω in the body frame")
     cells = figure.add_gridspec(3, len(boxes) + 1, width_ratios=[1.25, 1, 1][-len(boxes) - 1 :])
     for column, (half, centre, title) in enumerate(boxes):
         axis = figure.add_subplot(cells[:, column])
@@ -198,7 +191,7 @@ def _omega_figure(columns: dict[str, np.ndarray]):
     """ω in the body frame against time, for a body with other motion than a free one."""
     omega = [columns[f"omega_body_{i}"] for i in "123"]
     fastest = max(np.abs(part).max() for part in omega)
-    figure = _titled_figure("ω in the body frame", 8, 6.4)
+    figure = new_figure(8, 6.4, title="ω in the body frame")
     labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
     _draw_series(figure, figure.add_gridspec(3, 1), columns["time"], omega, labels, 1e-9 * fastest, 2 * fastest or 1.0)
     return figure
@@ -222,7 +215,7 @@ def _path_figure(columns: dict[str, np.ndarray], down: np.ndarray | None):
     if np.ptp(level @ np.cross(up, along)) > least:
         first = along if abs(up[2]) < 1 - 1e-9 else np.eye(3)[0]
         planes.append(("from above", first, np.cross(up, first)))
-    figure = _titled_figure("path of the centre of mass", 4.2 + 3.8 * len(planes), 4.6)
+    figure = new_figure(4.2 + 3.8 * len(planes), 4.6, title="path of the centre of mass")
     cells = figure.add_gridspec(3, len(planes) + 1)
     labels, stack = ("x (m)", "y (m)", "z (m)"), cells[:, 0].subgridspec(3, 1)
     _draw_series(figure, stack, columns["time"], position.T, labels, least, span)
@@ -264,7 +257,7 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
             errors[LABELS.get(name, name.replace("_", " "))] = np.where(np.isfinite(error), error, np.nan)
     if not errors:
         return None
-    axis = (figure := _titled_figure("errors of the invariants", 8, 4.6)).subplots()
+    axis = (figure := new_figure(8, 4.6, title="errors of the invariants")).subplots()
     size = -(-len(columns["time"]) // 300)
     for color, (label, error) in zip(SERIES * len(errors), errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))

@@ -10,7 +10,7 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
 from rigidmd.engines.system import System
 from rigidmd.figures.body import body_figures
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, new_figure, shown_range, thin_series
+from rigidmd.figures.style import COOL, FAINT, WARM, new_figure, shown_range, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +43,7 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     time, stage = column["time"], samples["stage"][shown]
     last = stage == stage[-1]
     known = bool(np.isfinite(column["drift"][last]).any())  # an external engine may not report it
-    figure = new_figure(8, 7)
+    figure = new_figure(8, 7, title=f"{system.scene.name}: {n} molecules")
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
     if known:
@@ -67,7 +67,6 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
             axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
     for axis in (parts, temperature):
         _label_stages(axis, starts, [stages[k].label for k in np.unique(stage)])
-    figure.suptitle(f"{system.scene.name}: {n} molecules", color=INK, x=0.01, ha="left", fontsize=11)
     return figure
 
 

@@ -93,11 +93,14 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
         save_figure(figure, temporary, dpi=150)
 
 
-def new_figure(width: float, height: float, layout: Any = "constrained", **options) -> "Picture":
-    """An empty figure of this size, inches."""
+def new_figure(width: float, height: float, layout: Any = "constrained", title: str = "", **options) -> "Picture":
+    """An empty figure of this size, inches, under a title."""
     from rigidmd.figures.picture import Picture  # Matplotlib is slow to import
 
-    return Picture(figsize=(width, height), layout=layout, **options)
+    figure = Picture(figsize=(width, height), layout=layout, **options)
+    if title:
+        figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+    return figure
 
 
 def open_axis(axis, **ticks) -> None:

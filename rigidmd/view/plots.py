@@ -174,7 +174,7 @@ def columns_figure(record: Record, names: Sequence[str], described: dict[str, Co
     units: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         units.setdefault(described[name].unit, []).append(name)
-    figure = new_figure(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN)
+    figure = new_figure(FIGURE_WIDTH, PANEL_HEIGHT * len(units) + FIGURE_MARGIN, title=record.scene.name)
     axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (unit, members) in zip(axes, units.items(), strict=True):
         title = axis_label(members[0], unit) if len(members) == 1 else ""
@@ -185,7 +185,6 @@ def columns_figure(record: Record, names: Sequence[str], described: dict[str, Co
             axis.legend(frameon=False, fontsize=8, labelcolor=INK)
         axis.set_ylabel(f"{title}{suffix}", fontsize=9, color=INK)
     axes[-1].set_xlabel(f"time ({record.time_unit})", fontsize=9, color=INK)
-    figure.suptitle(record.scene.name, color=INK, x=0.01, ha="left", fontsize=11)
     return figure
 
 
