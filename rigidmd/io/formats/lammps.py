@@ -58,21 +58,8 @@ class Row(NamedTuple):
 
 def read_data(path: Path, lines: list[str], atom_types: dict[str, str] | None) -> list[Callable[[], Atoms]]:
     """The structure of a data file. The first line may name the units. Real and metal differ only in velocities."""
-    head, styles, sections = _sections(lines)
-    found = [row for row in head if row.words[1:] == ["atoms"]]
-    if not found:
-        raise structure_error(path, "has no line with the number of atoms before its sections, such as '3 atoms'")
-    rows = sections.get("Atoms", [])
-    count = atom_count(path, found[0].line, found[0].words[0], len(rows))
-    if count != len(rows):
-        raise structure_error(path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}")
-    return [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)] if rows else []
-
-
-def _sections(lines: list[str]) -> tuple[list[Row], dict[str, str], dict[str, list[Row]]]:
-    """The rows before the first section, and the comment after the name and the rows of each section."""
-    rows = head = []
-    styles, sections = {}, {}
+    rows = head = []  # before the first section
+    styles, sections = {}, {}  # the comment after the name, and the rows, of each section
     for number, line in enumerate(lines[1:], 2):
         data, _, comment = line.partition("#")
         words = data.split()
@@ -81,7 +68,14 @@ def _sections(lines: list[str]) -> tuple[list[Row], dict[str, str], dict[str, li
             styles[section], rows = comment.strip(), sections.setdefault(section, [])
         elif words:
             rows.append(Row(number, words, comment.strip()))
-    return head, styles, sections
+    found = [row for row in head if row.words[1:] == ["atoms"]]
+    if not found:
+        raise structure_error(path, "has no line with the number of atoms before its sections, such as '3 atoms'")
+    rows = sections.get("Atoms", [])
+    count = atom_count(path, found[0].line, found[0].words[0], len(rows))
+    if count != len(rows):
+        raise structure_error(path, f"line {found[0].line} promises {count} atoms, the section Atoms has {len(rows)}")
+    return [partial(_data_atoms, path, lines[0], head, styles.get("Atoms", ""), sections, atom_types)] if rows else []
 
 
 def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, list[Row]], atom_types) -> Atoms:
