@@ -126,7 +126,7 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     """The Euler angles against time: φ and ψ continuous over full rotations, θ with at least a minimum span."""
     time, theta = columns["time"], np.degrees(columns["theta"])
     phi, psi = columns["phi"].copy(), columns["psi"].copy()
-    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ is that of the next sample
+    # at θ = 0 or 180° only the sum or the difference of φ and ψ is defined: φ has its value in the next sample
     for k in np.flatnonzero(np.sin(columns["theta"][:-1]) < 1e-12)[::-1]:
         psi[k] += (phi[k] - phi[k + 1]) * np.sign(np.cos(columns["theta"][k]))
         phi[k] = phi[k + 1]
