@@ -61,7 +61,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F9", "error of a dielectric constant in a reaction field: the slope without its square",
-        "analysis/built_in/permittivity.py",
+        "analysis/built_in/rotation.py",
         "(whole / left) ** 2",
         "(whole / left)",
         ("test_analyse.py::test_the_error_of_a_dielectric_constant_in_a_reaction_field_follows_its_slope",),
@@ -82,7 +82,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F12", "bias of a mean against the step: its error forgets that the limit is made of the same mean",
-        "studies/accuracy/bias.py",
+        "studies/accuracy/averages.py",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
         ("test_accuracy.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",),

@@ -98,7 +98,7 @@ CORE = [
     ),
     Mutation(
         "A12", "dielectric constant: <M>² is not taken off",
-        "analysis/built_in/permittivity.py",
+        "analysis/built_in/rotation.py",
         "    off = dipole - dipole.mean(axis=0)",
         "    off = dipole",
         (

@@ -13,7 +13,7 @@ from typing import Any
 from rigidmd.analysis import registry
 from rigidmd.analysis.registry import Analysis, register, selected
 from rigidmd.analysis.result import AnalysisResult
-from rigidmd.analysis.source import frames_of_results
+from rigidmd.analysis.rigid_frames import frames_of_results
 from rigidmd.run.results import Results
 
 registry.load_built_in()

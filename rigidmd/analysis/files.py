@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
-from rigidmd.analysis.source import frames_of_folder
+from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import (
     COLORS,
@@ -31,10 +31,8 @@ from rigidmd.io.write import nine_digits, write_csv, write_json
 from rigidmd.run.record import read_record
 
 ANALYSIS = "analysis.json"
-#: Size of a figure, inches, and most curves in it.
-WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10
-#: Headers of columns that are in the file and not drawn.
-UNDRAWN = re.compile(r"n .+-.+")
+WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10  # size of a figure, inches, and most curves in it
+UNDRAWN = re.compile(r"n .+-.+")  # headers of columns that are in the file and not drawn
 
 
 def write_results(
@@ -51,23 +49,19 @@ def write_results(
     for result in results:
         names = files[result.name] = [f"{curve.file}{end}" for curve in result.curves for end in (".csv", ".png")]
         for name in names:
-            others = {new.setdefault(name, result.name), owner.get(name, result.name)} - {result.name}
-            if others:
+            if others := {new.setdefault(name, result.name), owner.get(name, result.name)} - {result.name}:
                 raise OutputError(f"{folder / name} is a file of the analysis {others.pop()}; rename {result.name}")
-            known_there = name in owner or (is_built_in(result.name) and name in marked)
-            if (folder / name).exists() and not known_there:
+            is_ours = name in owner or (is_built_in(result.name) and name in marked)
+            if (folder / name).exists() and not is_ours:
                 raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
     add_to_folder(folder, [ANALYSIS, *new])
     entries, curves = dict(known), [curve for result in results for curve in result.curves]
-    for result in results:
+    for result in [*results, *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items())]:
         entries[result.name] = {
             "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
             "curves": [{key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves],
-            "files": files[result.name], "stretch": frames_used,
+            "files": files.get(result.name, []), "stretch": frames_used,
         }  # fmt: skip
-    for name, reason in failed.items():
-        lists = {"values": [], "notes": [reason], "curves": [], "files": []}
-        entries[name] = {"about": name, **lists, "stretch": frames_used}
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     for curve in curves:
         columns = dict([curve.axis])
@@ -187,8 +181,7 @@ def curve_figure(curve: Curve):
     return figure
 
 
-#: Fraction of the progress for reading frames.
-READING = 0.25
+READING = 0.25  # fraction of the progress for reading frames
 
 
 class AnalysisRequest(NamedTuple):

@@ -101,9 +101,8 @@ def selected(names: list[str]) -> list[Analysis]:
     known = sorted(KNOWN, key=analysis_order)
     for name in names:
         if name not in KNOWN:
-            raise OutputError(
-                f"unknown analysis {name!r}{did_you_mean(name, known) or ';'} there are {', '.join(known)}"
-            )
+            hint = did_you_mean(name, known) or ";"
+            raise OutputError(f"unknown analysis {name!r}{hint} there are {', '.join(known)}")
     return [KNOWN[name] for name in names or known]
 
 

@@ -13,11 +13,11 @@ from rigidmd.run.rigid_fit import Kind
 
 #: Blocks of frames whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
-#: Groups of molecules at most, whose scatter gives errors too.
-MAX_GROUPS = 10
+MAX_GROUPS = 10  # groups of molecules at most, whose scatter gives errors too
 #: Least length of a run for a value in correlation times of the whole system. For those of single molecules, of which
 #: there are many, it is `BLOCKS`, because each block should be one correlation time long.
 MIN_CORRELATION_TIMES = 20.0
+Measured = tuple[np.ndarray, np.ndarray]  # an array and its standard error
 
 
 class Value(NamedTuple):
@@ -104,12 +104,10 @@ class AnalysisResult:
     __repr__ = __str__
 
 
-def too_short(
-    name: str, unit: str, value: float, error: float | None, why: str, correlation: float | None = None
-) -> Value:
-    """No value, because the run is too short: why it is, and the value so far."""
+def too_short(name: str, unit: str, value: float, error: float | None, why: str, tau: float | None = None) -> Value:
+    """No value, because the run is too short: why it is, and the value so far. tau : correlation time (ps)"""
     so_far = f"{format_with_error(value, error)}{'' if unit in ('', '1') else f' {unit}'}"
-    return Value(name, unit, None, None, correlation, f"{why}. So far: {so_far}")
+    return Value(name, unit, None, None, tau, f"{why}. So far: {so_far}")
 
 
 def converged_value(
@@ -130,9 +128,7 @@ def converged_value(
     return Value(name, unit, value, error, correlation, note)
 
 
-def with_block_error(
-    frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def with_block_error(frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]) -> Measured:
     """An array computed from frames, and its standard error from blocks of them, of at least two frames, without the
     first ones if they do not divide."""
     whole, size = np.asarray(function(frames), float), len(frames) // BLOCKS
@@ -141,9 +137,7 @@ def with_block_error(
     return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
 
 
-def with_group_error(
-    frames: RigidFrames, kind: Kind, function: Callable[[RigidFrames, Kind], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def with_group_error(frames: RigidFrames, kind: Kind, function: Callable[[RigidFrames, Kind], np.ndarray]) -> Measured:
     """An array computed from the molecules of a species, and its standard error: the larger of two, from blocks of
     frames and from groups of molecules. Blocks are too similar in a gas, groups where molecules move together."""
     whole, error = with_block_error(frames, lambda part: function(part, kind))

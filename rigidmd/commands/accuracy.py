@@ -14,28 +14,22 @@ from rigidmd.commands.arguments import SCENE, argument, command, command_line, o
     "  rigidmd accuracy liquid.toml --averages --sample-ps 50 --timesteps 1,2,4,6,8 "
     "--integrators baoab,velocity_verlet+nose_hoover",
     *SCENE,
-    argument(
-        "--integrators", metavar="A,B,...",
+    argument("--integrators", metavar="A,B,...",
         help="integrators (default: the scene's and those that suit it; for a body also general ODE solvers, "
         "each with Q as a matrix, a quaternion and Euler angles: rk4, rk4_quaternion, rk4_euler_angles, dop853, "
         "dop853_quaternion, dop853_euler_angles). If the scene sets run.formulation, rk4, dop853 and radau use it, "
-        "and rk4_matrix uses the matrix",
-    ),
+        "and rk4_matrix uses the matrix"),
     argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body"),
     argument("--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)"),
     argument("--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"),
-    argument(
-        "--averages", type=float, metavar="PS", nargs="?", const=inf,
+    argument("--averages", type=float, metavar="PS", nargs="?", const=inf,
         help="molecules only. With PS: also average temperatures, energy and pressure over that time with every step, "
         "at constant energy. Without PS: only measure the bias of averages: sample the last stage under its thermostat "
         "(nvt, npt) with every integrator at every step. --integrators then accepts names with a thermostat, "
         "baoab+langevin (default: the method of the stage, baoab+langevin, velocity_verlet+velocity_rescaling, "
-        "velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest stable one",
-    ),
-    argument(
-        "--sample-ps", type=float, metavar="PS",
-        help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)",
-    ),
+        "velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest stable one"),
+    argument("--sample-ps", type=float, metavar="PS",
+        help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)"),
     *output_folder("runs/NAME-accuracy"), writes=True,
 )  # fmt: skip
 def _accuracy(options: argparse.Namespace) -> int:

@@ -20,22 +20,14 @@ class _List(argparse.Action):
     120, "measure g(r), diffusion, orientation, dielectric constant, viscosity and more in a run, each with its error",
     "rigidmd analyse runs/water --only rdf,diffusion --from 10ps",
     argument("folder", metavar="RUN", help="folder of a run, or of a sweep: means and errors over its runs"),
-    argument(
-        "--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
-        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them",
-    ),
-    argument(
-        "--from", dest="start", type=time_ps, metavar="TIME",
-        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)",
-    ),
-    argument(
-        "--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
-        help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)",
-    ),
-    argument(
-        "--trust", action="append", default=[], metavar="FILE.py",
-        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated",
-    ),
+    argument("--only", type=lambda text: [name.strip() for name in text.split(",") if name.strip()], default=[],
+        metavar="NAMES", help="these analyses, separated by commas (default: all); `--list` names them"),
+    argument("--from", dest="start", type=time_ps, metavar="TIME",
+        help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)"),
+    argument("--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
+        help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)"),
+    argument("--trust", action="append", default=[], metavar="FILE.py",
+        help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated"),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run", writes=True,
 )  # fmt: skip

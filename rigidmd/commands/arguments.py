@@ -25,8 +25,7 @@ class Command(NamedTuple):
     call: Callable[[argparse.Namespace], int]
 
 
-#: The commands of the imported modules, by name.
-COMMANDS: dict[str, Command] = {}
+COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by name
 
 
 def command(position: int, about: str, example: str, *arguments: Argument, **options: Any) -> Callable:
@@ -99,11 +98,10 @@ TRUST = argument(
 #: SCENE, --set and --trust, which `read_scene` reads.
 SCENE = (
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
+    argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
         help="override a key of the scene by its dotted path (an entry of a list by its number, counted from 0, or a "
-        "stage by its name); KEY= without a value removes the key; may be repeated",
-    ), TRUST,
+        "stage by its name); KEY= without a value removes the key; may be repeated"),
+    TRUST,
 )  # fmt: skip
 
 

@@ -11,9 +11,8 @@ from rigidmd.commands.arguments import SCENE, argument, command, read_scene
     60, "energies and forces of the start", "rigidmd energy water_dimer.toml --json", *SCENE,
     argument("--unit", choices=["kJ/mol", "kcal/mol", "eV", "K"], help="unit of energy (kJ/mol; J for a body)"),
     argument("--json", action="store_true", help="print JSON"),
-    argument(
-        "--accuracy", action="store_true", help="also measure the error of the Coulomb forces (Ewald sums and PME)"
-    ),
+    argument("--accuracy", action="store_true",
+        help="also measure the error of the Coulomb forces (Ewald sums and PME)"),
 )  # fmt: skip
 def _energy(options: argparse.Namespace) -> int:
     from rigidmd.run import Simulation

@@ -17,7 +17,7 @@ from rigidmd.engines.registry import programs
     *output_folder("NAME-ENGINE", "an earlier export"), writes=True,
 )  # fmt: skip
 def _export(options: argparse.Namespace) -> int:
-    from rigidmd.studies.export import export
+    from rigidmd.studies.other_engines import export
 
     scene = read_scene(options)
     folder = Path(options.output or f"{scene.name}-{options.to}")

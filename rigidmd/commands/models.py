@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rigidmd.commands.arguments import argument, command
 from rigidmd.commands.streams import warn
+from rigidmd.errors import MoleculeError
 
 
 @command(
@@ -13,23 +14,16 @@ from rigidmd.commands.streams import warn
     "rigidmd models tip4p2005 --draw -o water.svg\n  rigidmd models --from dye.xyz --parameters table.toml -o dye.toml",
     argument("model", nargs="?", metavar="NAME", help="model to show, or the .toml file of a custom model"),
     argument("--draw", action="store_true", help="draw it to NAME.png"),
-    argument(
-        "--from", dest="geometry", metavar="FILE",
-        help="write a custom model: a structure file with one molecule, of any format that a scene reads",
-    ),
-    argument(
-        "--parameters", metavar="TABLE",
-        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element",
-    ),
+    argument("--from", dest="geometry", metavar="FILE",
+        help="write a custom model: a structure file with one molecule, of any format that a scene reads"),
+    argument("--parameters", metavar="TABLE",
+        help="with --from: a .toml file with charges and Lennard-Jones parameters by name of an atom or element"),
     argument("--name", metavar="NAME", dest="custom_name", help="with --from: name of the model"),
-    argument(
-        "-o", "--output", metavar="FILE",
-        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)",
-    ),
+    argument("-o", "--output", metavar="FILE",
+        help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)"),
     argument("--force", action="store_true", help="replace that file"),
 )  # fmt: skip
 def _models(options: argparse.Namespace) -> int:
-    from rigidmd.errors import MoleculeError
     from rigidmd.scene.models import available_models, load_model, read_molecule
     from rigidmd.view.molecule_figure import models_table, molecule_text
 
@@ -60,7 +54,6 @@ def _models(options: argparse.Namespace) -> int:
 def _write_model(options: argparse.Namespace) -> int:
     """`models --from`."""
     from rigidmd.assemble.species import model_from_geometry
-    from rigidmd.errors import MoleculeError
     from rigidmd.io.scene_file import write_model
     from rigidmd.io.write import check_target
 

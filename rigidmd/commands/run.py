@@ -7,18 +7,15 @@ from pathlib import Path
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
 from rigidmd.commands.arguments import SCENE, add_engine, argument, command, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
+from rigidmd.errors import SceneError
 
 #: Options of a run that begins or continues.
 DURATION = (
     argument("--threads", type=int, metavar="N", help="threads (default: the scene's, or all cores)"),
-    argument(
-        "--walltime", type=seconds, metavar="H:MM:SS",
-        help="stop shortly before this time is up, with a checkpoint and exit code 75",
-    ),
-    argument(
-        "--until", type=time_ps, metavar="TIME",
-        help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run",
-    ),
+    argument("--walltime", type=seconds, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with a checkpoint and exit code 75"),
+    argument("--until", type=time_ps, metavar="TIME",
+        help="let the last stage end at this time of the run, such as 200ps or 1.5ns; lengthens a finished run"),
 )  # fmt: skip
 
 
@@ -26,10 +23,8 @@ DURATION = (
     30, "run a scene", "rigidmd run water.toml -o runs/water", *SCENE,
     argument("-o", "--output", metavar="DIR", help="folder for the results (default: runs/NAME)"),
     argument("--force", action="store_true", help="replace an earlier run in that folder"),
-    argument(
-        "--resume", action="store_true",
-        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start",
-    ),
+    argument("--resume", action="store_true",
+        help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start"),
     add_engine, *DURATION, writes=True,
 )  # fmt: skip
 def run(options: argparse.Namespace) -> int:
@@ -37,8 +32,6 @@ def run(options: argparse.Namespace) -> int:
 
     scene = read_scene(options)
     if options.threads is not None:
-        from rigidmd.errors import SceneError
-
         if isinstance(scene, BodyScene):
             raise SceneError(scene.source, ["--threads is for molecules; a single body uses one thread"])
         scene = read_scene(options, threads=options.threads)

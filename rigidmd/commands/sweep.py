@@ -1,6 +1,7 @@
 """`rigidmd sweep`."""
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rigidmd.commands import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME
 from rigidmd.commands.arguments import TRUST, argument, command, number, output_folder, seconds
 from rigidmd.commands.streams import announce, warn
-from rigidmd.errors import visible
+from rigidmd.errors import OutputError, visible
 
 if TYPE_CHECKING:
     from rigidmd.io.progress import Bar
@@ -27,38 +28,27 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
     "  rigidmd sweep water.toml --replicas 8\n"
     "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
-    argument(
-        "--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
+    argument("--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
         help="values of a key of the scene (entries of a list are counted from 0); KEY=1..8 for whole numbers; "
-        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run",
-    ),
-    argument(
-        "--replicas", type=number(int, 2, 10000, "a number of replicas from 2 on"), metavar="N",
-        help="run N seeds, from the scene's seed on: errors from their scatter",
-    ),
+        "KEY=VALUE the same for all; KEY,KEY=A,B for keys that vary together; may be repeated: all combinations run"),
+    argument("--replicas", type=number(int, 2, 10000, "a number of replicas from 2 on"), metavar="N",
+        help="run N seeds, from the scene's seed on: errors from their scatter"),
     *output_folder("runs/NAME-sweep", "an earlier sweep"),
     argument("--jobs", type=COUNT, metavar="N", help="points at a time (default: as many as fill all cores)"),
     argument("--threads", type=COUNT, metavar="N", help="threads of each point (default: cores over jobs)"),
-    argument(
-        "--walltime", type=seconds, metavar="H:MM:SS",
-        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job",
-    ),
-    argument(
-        "--scheduler", metavar="ADDRESS",
-        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here",
-    ),
+    argument("--walltime", type=seconds, metavar="H:MM:SS",
+        help="stop shortly before this time is up, with checkpoints and exit code 75; with --to slurm of each job"),
+    argument("--scheduler", metavar="ADDRESS",
+        help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here"),
     argument("--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"),
     argument("--collect", action="store_true", help="run nothing, and write table and figure of existing results"),
-    argument(
-        "--point", type=number(int, 0, inf, "the number of a point, from 0 on"), metavar="K",
-        help="run point K of an existing sweep, counted from 0",
-    ),
+    argument("--point", type=number(int, 0, inf, "the number of a point, from 0 on"), metavar="K",
+        help="run point K of an existing sweep, counted from 0"),
     TRUST, overrides=[], writes=True,
 )  # fmt: skip
 def _sweep(options: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
-    from rigidmd.errors import OutputError
     from rigidmd.studies.sweep.plan import parse_axes
     from rigidmd.studies.sweep.sweeping import open_existing_sweep, open_sweep, write_slurm_script
 
@@ -77,10 +67,8 @@ def _sweep(options: argparse.Namespace) -> int:
             return _collect(sweep)
         if options.to is None:
             return _run(options, sweep)
-        threads = options.threads or 1
-        path, count = write_slurm_script(
-            sweep.folder, sweep.manifest, options.walltime, threads, options.trust, OUT_OF_TIME
-        )
+        settings = options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
+        path, count = write_slurm_script(sweep.folder, sweep.manifest, *settings)
     print(f"{path}: {count} points; submit it: sbatch {shlex.quote(str(path))}")
     where = shlex.quote(str(sweep.folder))
     print(f"  when all have ended: rigidmd sweep {shlex.quote(options.scene)} -o {where} --collect")
@@ -89,8 +77,6 @@ def _sweep(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     """Raise OutputError for options that cannot be combined."""
-    from rigidmd.errors import OutputError
-
     if options.to is not None and options.walltime is None:
         raise OutputError("--to slurm needs --walltime, the time of each job: --walltime 4:00:00")
     if options.point is not None and not options.output:
@@ -118,11 +104,10 @@ def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
     print(f"{manifest.name}: {count} points in {folder}, {before} of them finished before", flush=True)
     if sweep.left:
         if options.scheduler is None:
-            runner = Pool(jobs, threads)
+            runner, where = Pool(jobs, threads), f"{jobs if jobs > 1 else 'one'} at a time"
         else:
             runner = Cluster(options.scheduler, jobs, threads, folder, Path.cwd())
-        at_a_time = f"{jobs} at a time" if jobs > 1 else "one at a time"
-        where = at_a_time if options.scheduler is None else f"on the cluster {options.scheduler}"
+            where = f"on the cluster {options.scheduler}"
         print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
         with progress_of(sweep.left, "points", True) as bar:
             outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _shown_on(bar))
@@ -174,8 +159,7 @@ def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
 
 def _print_results(sweep: "OpenSweep") -> None:
     """Write and print the table of what has finished."""
-    from rigidmd.studies.sweep.sweeping import collect
-    from rigidmd.studies.sweep.table import table_text
+    from rigidmd.studies.sweep.table import collect, table_text
 
     table, files = collect(sweep.folder, sweep.manifest)
     if files:
@@ -199,8 +183,6 @@ def _collect(sweep: "OpenSweep") -> int:
 def _run_point(options: argparse.Namespace) -> int:
     """`--point`: the point that a scheduler started."""
     if options.threads is not None:
-        import os
-
         os.environ["NUMBA_NUM_THREADS"] = str(options.threads)  # before Numba is imported
     from rigidmd.studies.sweep.sweeping import run_point
 
@@ -211,8 +193,5 @@ def _run_point(options: argparse.Namespace) -> int:
     print(f"{name}: {ended['state']}, {ended['seconds']:.3g} s")
     if ended["message"]:
         print(f"rigidmd: {name}: {visible(ended['message'])}", file=sys.stderr)
-    if ended["out_of_time"]:
-        return OUT_OF_TIME
-    if ended["state"] == "finished":
-        return 0
-    return FAILED if ended["state"] == "failed" else INTERRUPTED
+    codes = {"finished": 0, "failed": FAILED, "interrupted": INTERRUPTED}
+    return OUT_OF_TIME if ended["out_of_time"] else codes[ended["state"]]

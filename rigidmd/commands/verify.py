@@ -22,7 +22,7 @@ def _engine(parser: argparse.ArgumentParser) -> None:
 )  # fmt: skip
 def _verify(options: argparse.Namespace) -> int:
     from rigidmd.scene import MolecularScene
-    from rigidmd.studies.verify import verify
+    from rigidmd.studies.other_engines import verify
 
     scene = read_scene(options)
     if options.engine is None and isinstance(scene, MolecularScene) and not scene.engine.is_external:

@@ -23,8 +23,7 @@ VERSIONS_AND_MACHINE = (
 )  # fmt: skip
 #: Columns by which samples are matched: steps if they have the same times in both files, else times.
 STEP, TIMES = "Step", ("Time (ps)", "t")
-#: Bits of the significand of a float64.
-BITS = 53
+BITS = 53  # bits of the significand of a float64
 
 
 @dataclass

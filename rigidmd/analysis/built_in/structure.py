@@ -24,8 +24,7 @@ LARGEST, WIDTH = 10.0, 0.05
 K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
 #: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379, 55).
 BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
-#: Donors and acceptors of hydrogen bonds.
-BONDING = ("N", "O", "F")
+BONDING = ("N", "O", "F")  # donors and acceptors of hydrogen bonds
 
 
 @built_in("radial distribution functions g(r) of sites of different molecules", position=10)
@@ -42,9 +41,8 @@ def rdf(
     half = 0.5 * float(min(heights(cell).min() for cell in frames.cell))
     largest = min(half, LARGEST) if largest is None else largest
     if not 0 < width < largest <= half * (1 + 1e-9):
-        raise OutputError(
-            f"g(r) up to {largest:g} Å in bins of {width:g} Å is not possible: half the box is {half:.4g} Å"
-        )
+        asked = f"g(r) up to {largest:g} Å in bins of {width:g} Å"
+        raise OutputError(f"{asked} is not possible: half the box is {half:.4g} Å")
     pairs = [(first, second or first)] if first else _pairs(frames)
     thinned = _thinned(frames, ENOUGH_MOLECULES)
     bins = int(largest / width + 1e-9)
@@ -184,9 +182,8 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
-        raise OutputError(
-            f"this box has no wave vector shorter than {largest:g} 1/Å; the shortest is {shortest:.3g} 1/Å"
-        )
+        why = f"this box has no wave vector shorter than {largest:g} 1/Å"
+        raise OutputError(f"{why}; the shortest is {shortest:.3g} 1/Å")
     vectors, bin_of = _k_vectors(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
@@ -209,9 +206,8 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
         tau = correlation_time(values[:, top], thinned.span / (len(thinned) - 1))
         found.values.append(Value("highest peak of S(k)", "1", height, error, tau, note))
     if len(thinned) < len(frames):
-        found.notes.append(
-            f"of {len(thinned)} of {len(frames)} frames, and at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
-        )
+        vectors = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
+        found.notes.append(f"of {len(thinned)} of {len(frames)} frames, and {vectors}")
     return found
 
 
@@ -272,9 +268,8 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
     """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F) closer than `distance`
     (Å), with an angle to the bond of the hydrogen below `angle` (degrees). Raises OutputError."""
     if not any(_donors(kind.molecule) for kind in frames.kinds):
-        raise OutputError(
-            "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine: there are no hydrogen bonds"
-        )
+        why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
+        raise OutputError(f"{why}: there are no hydrogen bonds")
     thinned = _thinned(frames, ENOUGH_MOLECULES)
     number = len(frames.system.model.species)
     bonds = np.array([_bonds(thinned, k, distance, angle) for k in range(len(thinned))])  # (f, n)
@@ -282,9 +277,8 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
     value, error = mean_and_error(each)
     most = int(bonds.max()) + 1
     fraction = np.array([np.mean(bonds == k) for k in range(most)])
-    curve = Curve(
-        "hydrogen_bonds", ("hydrogen bonds", np.arange(most)), "fraction of molecules", {"share": fraction}, bars=True
-    )
+    axis = ("hydrogen bonds", np.arange(most))
+    curve = Curve("hydrogen_bonds", axis, "fraction of molecules", {"share": fraction}, bars=True)
     note = [f"of {len(thinned)} of {len(frames)} frames"] if len(thinned) < len(frames) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time(each, thinned.span / (len(thinned) - 1))

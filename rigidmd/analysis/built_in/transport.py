@@ -12,8 +12,7 @@ from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import BAR
 
-#: Numbers that are transformed at a time.
-AT_ONCE = 4_000_000
+AT_ONCE = 4_000_000  # numbers that are transformed at a time
 
 
 def correlation(series: np.ndarray, lags: int) -> np.ndarray:
@@ -41,10 +40,8 @@ def squared_displacement(path: np.ndarray, lags: int) -> np.ndarray:
     return np.maximum(both - 2 * correlation(path, lags) * path.shape[2], 0.0)
 
 
-#: Lags that are fitted, as fractions of a block.
-FIT_FROM, FIT_TO = 0.1, 0.5
-#: Relative change of the slope of the displacement above which molecules do not diffuse yet.
-BEND = 0.1
+FIT_FROM, FIT_TO = 0.1, 0.5  # lags that are fitted, as fractions of a block
+BEND = 0.1  # relative change of the slope of the displacement above which molecules do not diffuse yet
 #: Yeh & Hummer 2004, J. Phys. Chem. B 108, 15873: cubic boxes.
 YEH_HUMMER = 2.837297
 #: One mPa s in u/(Å ps), and 1e-9 m²/s in Å²/ps.
@@ -104,7 +101,12 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
     found = AnalysisResult("diffusion", "diffusion coefficients", curves=[_so_far(frames, interval, lags)])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = _cubic_edge(frames)
-    eta = viscosity_of(frames) if viscosity_mPa_s is None else None
+    eta = Value("viscosity", "mPa s", viscosity_mPa_s, None)
+    if viscosity_mPa_s is None:
+        try:
+            eta = viscosity(frames).value()
+        except OutputError as error:
+            eta = eta._replace(note=str(error))
     for kind in frames.moving:
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(frames, kind, slopes)).tolist()
@@ -121,15 +123,14 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         if value.value is None or edge is None:
             continue
         name = f"D of {kind.name} in an infinite box"
-        viscosity = viscosity_mPa_s if eta is None else eta.value
-        if viscosity is None:
-            note = f"no correction for the size of the box without a viscosity: {eta.note if eta else ''}"
+        if eta.value is None:
+            note = f"no correction for the size of the box without a viscosity: {eta.note}"
             found.values.append(Value(name, "1e-9 m²/s", None, None, None, note))
             continue
-        more = YEH_HUMMER * frames.thermal_energy / (6 * np.pi * viscosity * MPA_S * edge) / NM2_PER_S
-        source = "as given, without its error" if eta is None else "from this run"
-        note = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {viscosity:.3g} mPa s, {source}"
-        doubt = more * (eta.error or 0.0) / viscosity if eta else 0.0
+        more = YEH_HUMMER * frames.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
+        source = "from this run" if viscosity_mPa_s is None else "as given, without its error"
+        note = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {eta.value:.3g} mPa s, {source}"
+        doubt = more * (eta.error or 0.0) / eta.value
         both = None if value.error is None else float(np.hypot(value.error, doubt))
         found.values.append(value._replace(name=name, value=value.value + more, error=both, note=note))
     if edge is None and frames.has_box:
@@ -169,8 +170,7 @@ def _cubic_edge(frames: RigidFrames) -> float | None:
     return edge if np.abs(cell - edge * np.eye(3)).max() < 0.01 * edge else None
 
 
-#: Number of segments of the tensor, and the least length of each, ps.
-SEGMENTS, SHORTEST = 10, 2.0
+SEGMENTS, SHORTEST = 10, 2.0  # number of segments of the tensor, and the least length of each, ps
 #: Least points of a fit, and least correlation over one interval of the tensor: below it the trapezoidal rule is more
 #: than 4 % too large, if the correlation is an exponential.
 FEWEST, CLOSE = 8, 0.5
@@ -179,8 +179,7 @@ FEWEST, CLOSE = 8, 0.5
 DOUBT = 0.08
 #: Fraction of the integral that the second half of the fit may add, as an exponential does with 2.2 of its times there.
 GROWS = 0.25
-#: Bootstrap samples of the segments for the error of the fit.
-DRAWS = 50
+DRAWS = 50  # bootstrap samples of the segments for the error of the fit
 
 
 @built_in("viscosity from the pressure tensor, by Green and Kubo", position=100)
@@ -195,9 +194,8 @@ def viscosity(frames: RigidFrames) -> AnalysisResult:
     if not frames.has_box:
         raise OutputError("a viscosity needs a box")
     if frames.tensor is None or len(frames.tensor) < 2:
-        raise OutputError(
-            "a viscosity needs the pressure tensor: output.pressure_tensor_interval_ps = 0.01 suits water"
-        )
+        advice = "output.pressure_tensor_interval_ps = 0.01 suits water"
+        raise OutputError(f"a viscosity needs the pressure tensor: {advice}")
     gaps = np.diff(frames.tensor[:, 0])
     interval = float(gaps.mean())
     if np.ptp(gaps) > EVEN * gaps.max():
@@ -271,11 +269,3 @@ def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float |
     except (RuntimeError, ValueError):
         return None
     return float(best[0] + best[1])
-
-
-def viscosity_of(frames: RigidFrames) -> Value:
-    """The viscosity (mPa s), or a value with a note on why there is none."""
-    try:
-        return viscosity(frames).value()
-    except OutputError as error:
-        return Value("viscosity", "mPa s", None, None, None, str(error))

@@ -20,10 +20,8 @@ DEFAULT_INTEGRATORS = (
 )
 #: Time steps per force evaluation, relative to the scene's; longer ones follow until one fails.
 LADDER = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-#: Rotation of a spinning body per force evaluation in the middle of the ladder, rad.
-RADIANS = 0.1
-#: Step of a body that does not rotate, in the step of its scene, which is assumed to be suitable.
-AT_REST = 8.0
+RADIANS = 0.1  # rotation of a spinning body per force evaluation in the middle of the ladder, rad
+AT_REST = 8.0  # step of a body that does not rotate, in the step of its scene, which is assumed to be suitable
 AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are singular"
 
 
@@ -48,9 +46,8 @@ def measure_accuracy(
     integrators = list(dict.fromkeys(_method_name(name, scene) for name in integrators or []))
     if unknown := [name for name in integrators if name not in known]:
         of_all = f"(known: {', '.join(known)})"
-        raise SceneError(
-            "--integrators", [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
-        )
+        errors = [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
+        raise SceneError("--integrators", errors)
     lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
         raise SceneError("accuracy", ["time steps, span, averages and repeats must be finite and greater than 0"])

@@ -1,13 +1,12 @@
 """Report of `rigidmd accuracy --averages`: a table, conclusions, accuracy.csv and .json, averages.png and .html."""
 
-from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
 from rigidmd.io.write import Column, Table, with_error, write_json
-from rigidmd.studies.accuracy.bias import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
+from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
 from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
@@ -26,34 +25,26 @@ def describe_scale(quantity: AveragedQuantity) -> str:
 
 def full_table(found: Averages) -> Table:
     """Means and biases of all runs, with their errors."""
-
-    def mean(run: AverageRun, quantity: AveragedQuantity) -> Sequence[float] | None:
-        return (point := found.point(run, quantity)) and point[2:]
-
     columns = [
         Column("integrator", lambda run: run.integrator), Column("thermostat", lambda run: run.thermostat),
         Column("step (fs)", lambda run: run.timestep), Column("forces per ps", lambda run: run.forces_per_ps),
         Column("seconds per ns", lambda run: run.seconds_per_ns),
     ]  # fmt: skip
     for q in found.quantities:
-        columns += with_error(f"{q.name} ({q.unit})", lambda run, q=q: mean(run, q))
+        columns += with_error(f"{q.name} ({q.unit})", lambda run, q=q: (point := found.point(run, q)) and point[2:])
         columns += with_error(f"bias of {q.name} ({_bias_unit(q)})", lambda run, q=q: found.bias(run, q))
     return Table([*columns, Column("failure", lambda run: run.failure)], found.runs)
 
 
 def brief_table(found: Averages) -> Table:
     """Biases with their errors, as text."""
-
-    def bias(run: AverageRun, quantity: AveragedQuantity) -> str | None:
-        return (found_bias := found.bias(run, quantity)) and format_signed(*found_bias)
-
     return Table([
         Column("method", lambda run: run.method),
         Column("step (fs)", lambda run: f"{run.timestep:g}"),
         Column("forces/ps", lambda run: f"{run.forces_per_ps:.4g}"),
         Column("s/ns", lambda run: "fails" if run.failure else run.seconds_per_ns),
-        *(Column(f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})", lambda run, q=q: bias(run, q))
-          for q in found.quantities),
+        *(Column(f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})",
+                 lambda run, q=q: (bias := found.bias(run, q)) and format_signed(*bias)) for q in found.quantities),
     ], found.runs)  # fmt: skip
 
 

@@ -14,8 +14,7 @@ from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html", "accuracy_averages.csv")
-#: Spread of repeated timings that causes a warning.
-DOUBTFUL = 0.2
+DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
 ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
@@ -124,9 +123,8 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
     if found.sampled and (verlet := [t for t in found.trials if f"{name} unbiased" in t.averages]):
         longest = max(verlet, key=lambda t: t.timestep)
         on, unbiased = (format_signed(*longest.averages[name + kind]) for kind in ("", " unbiased"))
-        lines.append(
-            f"velocity_verlet at {longest.timestep:.3g} fs: {name} is {on} K on the steps, {unbiased} unbiased"
-        )
+        at = f"velocity_verlet at {longest.timestep:.3g} fs"
+        lines.append(f"{at}: {name} is {on} K on the steps, {unbiased} unbiased")
     return lines
 
 
@@ -146,6 +144,9 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
     ]
 
 
+COMMON = "velocity_verlet"  # integrator to compare with
+
+
 class Cheapest(NamedTuple):
     """The integrator that reaches an error, or each of several errors, in the least run time."""
 
@@ -153,9 +154,7 @@ class Cheapest(NamedTuple):
     target: float  # the largest
     integrator: str
     at: ReachedError
-    common: str  # integrator to compare with; empty if it is the same or does not reach the target
-    times_faster: float
-    common_step: float
+    common: ReachedError | None  # of `COMMON`; None if it is the cheapest or does not reach the target
     rivals: tuple[tuple[str, ReachedError], ...]  # others, as fast within the spread of the timings
 
 
@@ -167,7 +166,7 @@ def cheapest(found: IntegratorAccuracy) -> list[Cheapest]:
         "energy_rms": ("an energy error", s.energy_unit),
         "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
     }
-    names, common, lines = list(dict.fromkeys(t.integrator for t in found.trials)), "velocity_verlet", []
+    names, lines = list(dict.fromkeys(t.integrator for t in found.trials)), []
     for error, (what, unit) in kinds.items():
         worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
         same = None
@@ -177,12 +176,11 @@ def cheapest(found: IntegratorAccuracy) -> list[Cheapest]:
             if target > worst or len(reached) < 2 or blind:
                 continue
             best = min(reached, key=lambda name: reached[name].seconds)
-            at, other = reached.pop(best), reached.get(common)
+            at, common = reached.pop(best), reached.get(COMMON)
             slow = at.seconds * (1 + at.spread / 2)
             rivals = tuple((name, r) for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow)
             described = f"{what} of {target:.0e} {unit}".rstrip()
-            faster, its_step = (other.seconds / at.seconds, other.step) if other else (0.0, 0.0)
-            line = Cheapest(described, float(target), best, at, common if other else "", faster, its_step, rivals)
+            line = Cheapest(described, float(target), best, at, common, rivals)
             if same is not None and line[2:] == same[2:]:
                 described = f"{what} of {same.target:.0e} to {target:.0e} {unit}".rstrip()
                 line = line._replace(error=described, target=same.target)
@@ -198,8 +196,8 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
     for c in cheapest(found):
         limit = f" ({c.at.limit})" if c.at.limit else ""
         line = f"for {c.error} over {s.span:g} {per} the cheapest is {c.integrator} at {c.at.step:.2g} {unit}{limit}"
-        if c.common and c.common not in [name for name, _ in c.rivals]:
-            line += f": {c.times_faster:.1f} times faster than {c.common} at {c.common_step:.2g} {unit}"
+        if c.common and COMMON not in [name for name, _ in c.rivals]:
+            line += f": {c.common.seconds / c.at.seconds:.1f} times faster than {COMMON} at {c.common.step:.2g} {unit}"
         if c.rivals:
             rivals = ", ".join(f"{name} at {at.step:.2g} {unit}" for name, at in c.rivals)
             line += f"; as fast within the spread of the timings: {rivals}"
@@ -278,7 +276,7 @@ def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     rows = [
         [c.error, colored[c.integrator], f"{c.at.step:.2g}" + (f" ({c.at.limit})" if c.at.limit else ""),
          f"{c.at.seconds / found.trial_system.span:.2g}",
-         f"{c.times_faster:.1f} (at {c.common_step:.2g})" if c.common else "",
+         f"{c.common.seconds / c.at.seconds:.1f} (at {c.common.step:.2g})" if c.common else "",
          ", ".join(f"{name} at {at.step:.2g}" for name, at in c.rivals)]
         for c in cheapest(found)
     ]  # fmt: skip
@@ -295,6 +293,5 @@ def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     if any(trial.averages for trial in found.trials):
         averages = table(*brief_averages_table(found).shown(), marked=colored)
         parts.append(section(f"Averages over {found.sampled:g} ps", averages))
-    return page(
-        f"{found.trial_system.name}: error against run time", [*parts, section("How to repeat it", code(command))]
-    )
+    parts.append(section("How to repeat it", code(command)))
+    return page(f"{found.trial_system.name}: error against run time", parts)

@@ -26,8 +26,7 @@ FAMILIES = {
     "kahan_li_6": {"integrator": "kahan_li_6"},
 }
 SPLIT, EXACT = "velocity_verlet", "velocity_verlet, exact rotor"
-#: A body without rotation, which has no rotor.
-POINT = "velocity_verlet of a point"
+POINT = "velocity_verlet of a point"  # a body without rotation, which has no rotor
 QUICK = (SPLIT, EXACT, "srkn_4")
 TEXTBOOK = {
     f"{solver}, {form}": {"integrator": solver, "formulation": form}

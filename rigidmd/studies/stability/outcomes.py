@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import inf, isnan, nan
+from math import inf, nan
 from typing import NamedTuple
 
 from rigidmd.run.summary import LARGE_ENERGY_ERROR
@@ -51,8 +51,7 @@ class CaseRun:
             return REFUSED
         if seen.error <= self.allowed:
             return RIGHT
-        reported = not seen.reported_error <= LARGE_ENERGY_ERROR and not isnan(seen.reported_error)
-        return REPORTED if reported else UNDETECTED
+        return REPORTED if seen.reported_error > LARGE_ENERGY_ERROR else UNDETECTED
 
 
 class StepLimit(NamedTuple):
@@ -83,8 +82,7 @@ class CaseResult:
     seconds: float = nan
 
     def add(
-        self,
-        setting: str, outcome: Outcome, allowed: float = nan, family: str = "", x: float = nan, step: float = nan,
+        self, setting: str, outcome: Outcome, allowed: float = nan, family: str = "", x: float = nan, step: float = nan,
         expected: tuple[str, ...] = (RIGHT,),
     ) -> None:  # fmt: skip
         self.runs.append(CaseRun(setting, family, x, step, allowed, expected, outcome))
@@ -153,6 +151,5 @@ def longest_step(
         beyond = next(way for way in order if way in ways)
         message = ways[beyond].crash or ways[beyond].message
     curve = tuple(sorted((step, outcome.reported_error) for step, outcome in seen.items()))
-    return StepLimit(
-        setting, family, inf if bad == inf else good, beyond, message, sum(o.seconds for o in seen.values()), curve
-    )
+    seconds = sum(outcome.seconds for outcome in seen.values())
+    return StepLimit(setting, family, inf if bad == inf else good, beyond, message, seconds, curve)

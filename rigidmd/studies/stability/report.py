@@ -21,12 +21,9 @@ from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain
 
 FILES = ("stability.csv", "stability.html", "stability.md")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
-#: How a verdict is shown.
-KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))
-#: Messages of a case at most.
-MESSAGES = 3
-#: Errors of exactly 0 are drawn here.
-FLOOR = 1e-17
+KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))  # how a verdict is shown
+MESSAGES = 3  # messages of a case at most
+FLOOR = 1e-17  # errors of exactly 0 are drawn here
 
 
 def selected_cases(names: list[str] | None) -> list[StabilityCase]:
@@ -51,8 +48,7 @@ def run_cases(
         yield result
 
 
-def row_of(result: CaseResult, family: str) -> list[str]:
-    """The row of a case and an integrator in the table of all."""
+def _row(result: CaseResult, family: str) -> list[str]:
     runs = [t for t in result.runs if t.family == family]
     limits = [limit for limit in result.limits if limit.family == family]
     verdicts = Counter(t.verdict for t in runs)
@@ -78,7 +74,8 @@ def table_text(results: list[CaseResult]) -> str:
 
 
 def rows_of(results: list[CaseResult]) -> list[list[str]]:
-    return [row_of(result, family) for result in results for family in result.families]
+    """A row for each case and integrator."""
+    return [_row(result, family) for result in results for family in result.families]
 
 
 def conclusions(results: list[CaseResult]) -> list[str]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -19,16 +19,12 @@ from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
 
 MANIFEST, TABLE, FIGURE, SCRIPT = SWEEP, "sweep.csv", "sweep.png", "sweep.sbatch"
-#: While this file exists, points on other machines stop at their next observation.
-STOP = "stop"
+STOP = "stop"  # while this file exists, points on other machines stop at their next observation
 FILES = (MANIFEST, TABLE, FIGURE, SCRIPT, STOP)
-#: Version of the format of the manifest.
-SCHEMA = 1
-WAITING, RUNNING, FINISHED, INTERRUPTED, FAILED = "waiting", "running", "finished", "interrupted", "failed"
-#: The key whose values make replicas.
-SEED = "seed"
-#: Most letters of the name of a folder.
-LONGEST = 120
+SCHEMA = 1  # version of the format of the manifest
+State = Literal["waiting", "running", "finished", "interrupted", "failed"]
+SEED = "seed"  # the key whose values make replicas
+LONGEST = 120  # most letters of the name of a folder
 
 
 class ManifestVersion(BaseModel):
@@ -42,7 +38,7 @@ class SweepPoint:
     folder: str  # its name
     values: dict[str, Any]  # swept key -> value
     scene_sha256: str  # digest of its scene, as it was read, and of the files that it reads
-    state: Annotated[str, Field(pattern="^(waiting|running|finished|interrupted|failed)$")] = WAITING
+    state: State = "waiting"
     ran_sha256: str | None = None  # scene_sha256 of the summary of its run, once it has ended
     message: str | None = None  # why it failed
     seconds: Bounded = 0.0  # run time of all attempts
@@ -87,9 +83,8 @@ def read_manifest(folder: Path) -> Manifest:
     if schema is None:
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")
     if schema.schema_ > SCHEMA:
-        raise OutputError(
-            f"{path}: was written by a later rigidmd (version {schema.schema_} of the format; this one reads {SCHEMA})"
-        )
+        versions = f"(version {schema.schema_} of the format; this one reads {SCHEMA})"
+        raise OutputError(f"{path}: was written by a later rigidmd {versions}")
     found = not_none(read_json(path, Manifest, remedy))
     names = [point.folder for point in found.points]
     problem = ""
@@ -109,7 +104,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     write_json(folder / MANIFEST, asdict(manifest), indent=1)
 
 
-def check_sweep_folder(folder: Path) -> None:
+def check_free(folder: Path) -> None:
     """Raise OutputError if a folder holds other files; changes nothing."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name another folder with -o")
@@ -133,14 +128,14 @@ def clear_sweep(folder: Path, names: Iterable[str]) -> None:
                     inner.rmdir()
 
 
-def state_on_disk(folder: Path, point: SweepPoint) -> str:
+def state_on_disk(folder: Path, point: SweepPoint) -> State:
     """The state that the folder of a point shows: finished, interrupted, or waiting if nothing has run there."""
     inner = folder / point.folder
     with contextlib.suppress(OutputError):
         summary = read_json(inner / SUMMARY, Summary) or Summary(interrupted=True)
         if not summary.interrupted and point.ran_sha256 in (None, summary.scene_sha256):
-            return FINISHED
-    return INTERRUPTED if (inner / MARKER).is_file() else WAITING
+            return "finished"
+    return "interrupted" if (inner / MARKER).is_file() else "waiting"
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:

@@ -14,13 +14,12 @@ from math import inf, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.assemble.scenes import resolve
 from rigidmd.core.toml import parse_whole_number, plain_values, shorten_repr
 from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
 from rigidmd.run.resume import NOT_COMPARED, differences, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.studies.sweep.folder import (
-    FAILED,
-    FINISHED,
     SEED,
     Manifest,
     SweepPoint,
@@ -34,11 +33,9 @@ from rigidmd.studies.sweep.folder import (
     value_name,
 )
 
-#: Largest number of points of a sweep.
-MOST_POINTS = 100_000
+MOST_POINTS = 100_000  # largest number of points of a sweep
 OPTION = "--set"
-#: Largest number of differences in a message.
-MOST_SHOWN = 8
+MOST_SHOWN = 8  # largest number of differences in a message
 
 
 class Axis(NamedTuple):
@@ -118,8 +115,8 @@ def _split_at_commas(listed: str, text: str) -> list[str]:
     return [part.strip() for part in [*parts, listed[begin:]]]
 
 
-def check_axes(axes: Sequence[Axis]) -> list[Axis]:
-    """The axes, if they make a sweep. Raises SceneError with all errors."""
+def _check_axes(axes: Sequence[Axis]) -> None:
+    """Raise SceneError with all errors of axes that make no sweep."""
     errors = []
     for key, times in Counter(key for axis in axes for key in axis.keys).items():
         if times > 1:
@@ -138,7 +135,6 @@ def check_axes(axes: Sequence[Axis]) -> list[Axis]:
         errors.append(f"these are {count} points; a sweep has {MOST_POINTS} at most")
     if errors:
         raise SceneError(OPTION, errors)
-    return list(axes)
 
 
 def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
@@ -156,6 +152,19 @@ def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
     return found
 
 
+def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, Any]) -> list[Axis]:
+    """The axes with an axis of the seeds of replicas."""
+    if "body" in data:
+        raise SceneError("--replicas", [f"{scene} is a single body, whose motion has no seed"])
+    with_seed = [axis for axis in axes if SEED in axis.keys]
+    if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
+        raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
+    seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
+    if not isinstance(seed, int):
+        raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be a whole number"])
+    return [*(axis for axis in axes if axis not in with_seed), Axis((SEED,), tuple(range(seed, seed + replicas)))]
+
+
 def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
     """The values of the swept keys at each point, the last axis fastest; only the first of keys that vary together."""
     swept = {axis.keys[0]: axis.values for axis in axes if axis.swept}
@@ -165,6 +174,7 @@ def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
 def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
     """The checked points of a sweep over a scene file, and whether the scene is a single body. Raises SceneError with
     all errors of all points."""
+    _check_axes(axes)
     keys = {axis.keys[0]: list(axis.keys) for axis in axes if axis.swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
@@ -227,14 +237,8 @@ class Digests:
 
 def _build_error(scene: MolecularScene | BodyScene) -> RigidMDError | None:
     """The error that only building the system of a scene raises."""
-    from rigidmd.assemble.body import build_body
-    from rigidmd.assemble.build import build
-
     try:
-        if not isinstance(scene, BodyScene):
-            build(scene)
-        elif not scene.run.is_auto:
-            build_body(scene)
+        resolve(scene)  # pyright: ignore[reportArgumentType]  (either kind)
     except RigidMDError as error:
         return error
     return None
@@ -281,7 +285,7 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> Manifest:
 def update_state(folder: Path, point: SweepPoint) -> None:
     """Read the state of a point from its folder; a failed point keeps its state until it runs again."""
     found = state_on_disk(folder, point)
-    if found == FINISHED or point.state != FAILED:
+    if found == "finished" or point.state != "failed":
         point.state = found
 
 

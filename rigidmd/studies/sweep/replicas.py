@@ -14,7 +14,7 @@ from rigidmd.core.statistics import standard_error
 from rigidmd.errors import OutputError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Column, Table, nine_digits, with_error
-from rigidmd.studies.sweep.folder import FINISHED, describe_values, point_name, read_manifest, short_keys, state_on_disk
+from rigidmd.studies.sweep.folder import describe_values, point_name, read_manifest, short_keys, state_on_disk
 from rigidmd.studies.sweep.table import key_columns
 
 ANALYSES = "analysis.csv"
@@ -34,16 +34,14 @@ class Combination(NamedTuple):
     files: list[Path]
 
 
-def analyse_sweep(
-    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object]
-) -> list[Combination]:
+def analyse_sweep(folder: Path, request: AnalysisRequest, progress: Callable[..., object]) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
     Means over replicas are written into the folder of the sweep, or into a folder for each combination of the other
     keys, and all values into analysis.csv. progress : called with the fraction that is done and what is being done
     """
     manifest = read_manifest(folder)
-    ready = [point for point in manifest.points if state_on_disk(folder, point) == FINISHED]
+    ready = [point for point in manifest.points if state_on_disk(folder, point) == "finished"]
     if not ready:
         raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
     done: dict[str, AnalysisOutput] = {}

@@ -1,7 +1,6 @@
 """`rigidmd sweep`: its folder is opened, its points run here or by a script for Slurm, its results are written."""
 
 import contextlib
-import csv
 import os
 import shlex
 import signal
@@ -9,38 +8,24 @@ import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
-from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
 from rigidmd.run.schedule import checked_walltime
 from rigidmd.run.signals import signal_handler
-from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, Pool
-from rigidmd.studies.sweep.folder import (
-    FAILED,
-    FILES,
-    FINISHED,
-    INTERRUPTED,
-    RUNNING,
-    SCRIPT,
-    SEED,
-    TABLE,
-    Manifest,
-    SweepPoint,
-    check_sweep_folder,
-    read_manifest,
-    write_manifest,
-)
-from rigidmd.studies.sweep.plan import Axis, axes_of, check_axes, merge_manifests, order_axes, read_points, update_state
-from rigidmd.studies.sweep.table import Table, table_of, write_sweep_figure
+from rigidmd.studies.sweep.folder import FILES, SCRIPT, Manifest, SweepPoint, check_free, read_manifest, write_manifest
+from rigidmd.studies.sweep.plan import Axis, axes_of, merge_manifests, order_axes, read_points, update_state, with_seeds
+from rigidmd.studies.sweep.table import Table, collect
 from rigidmd.studies.sweep.worker import PointResult, PointTask, Send, run_task
 
 #: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this fraction.
@@ -79,7 +64,7 @@ class OpenSweep(NamedTuple):
     @property
     def left(self) -> int:
         """Points that have not finished."""
-        return sum(point.state != FINISHED for point in self.manifest.points)
+        return sum(point.state != "finished" for point in self.manifest.points)
 
 
 def open_sweep(
@@ -97,15 +82,14 @@ def open_sweep(
     for path in trust:
         trust_file(path)
     data, _ = read_tables(scene)
-    axes = axes if replicas is None else _with_seeds(scene, axes, replicas, data)
+    axes = axes if replicas is None else with_seeds(scene, axes, replicas, data)
     keys = [key for axis in axes for key in axis.keys]
     if trust and not any("module" in str(part) for part in (data.get("forces"), keys)):
         raise SceneError("--trust", [f"{scene} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
     folder = folder or Path("runs") / f"{named or default_name(scene)}-sweep"
-    check_sweep_folder(folder)
-    axes = check_axes(axes if force else order_axes(folder, axes))
-    fresh, is_body = read_points(scene, axes)
+    check_free(folder)
+    fresh, is_body = read_points(scene, axes if force else order_axes(folder, axes))
     lock = stack.enter_context(FolderLock(folder))
     manifest = merge_manifests(folder, fresh, force)
     with writing(folder, "made", "; name another folder with -o"):
@@ -125,19 +109,6 @@ def open_existing_sweep(folder: Path, stack: ExitStack) -> OpenSweep:
         update_state(folder, point)
     write_manifest(folder, manifest)
     return OpenSweep(folder, manifest, False)
-
-
-def _with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, Any]) -> list[Axis]:
-    """The axes with an axis of the seeds of replicas."""
-    if "body" in data:
-        raise SceneError("--replicas", [f"{scene} is a single body, whose motion has no seed"])
-    with_seed = [axis for axis in axes if SEED in axis.keys]
-    if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
-        raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
-    seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
-    if not isinstance(seed, int):
-        raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be a whole number"])
-    return [*(axis for axis in axes if axis not in with_seed), Axis((SEED,), tuple(range(seed, seed + replicas)))]
 
 
 def jobs_and_threads(count: int, jobs: int | None, threads: int | None, is_body: bool) -> tuple[int, int]:
@@ -173,21 +144,11 @@ def sweep(
             raise KeyboardInterrupt
         table, _ = collect(there.folder, manifest)
     for point in manifest.points:
-        if point.state != FINISHED:
+        if point.state != "finished":
             count = len(outcome.failed) + len(outcome.left)
             why = point.message or "it was stopped"
             raise SimulationError(f"{count} of {len(manifest.points)} points failed; {point.folder}: {why}")
     return table
-
-
-def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
-    """The table of the finished points, and the files with table and figure. Raises OutputError."""
-    table = table_of(folder, manifest)
-    if not any(row.runs for row in table.rows):
-        return table, []
-    table.as_columns().write(folder / TABLE, csv.QUOTE_NONNUMERIC)
-    files = [folder / TABLE, write_sweep_figure(table, manifest.name)]
-    return table, [path for path in files if path is not None and path.is_file()]
 
 
 def run_point(
@@ -213,7 +174,7 @@ def write_slurm_script(
     walltime : wall time of a job, s; again : exit code of a run whose time was up. Raises OutputError.
     """
     path = folder.absolute() / SCRIPT
-    left = [k for k, point in enumerate(manifest.points) if point.state != FINISHED]
+    left = [k for k, point in enumerate(manifest.points) if point.state != "finished"]
     words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
     words += [word for trusted in trust for word in ("--trust", str(Path(trusted).absolute()))]
     here = str(Path.cwd())
@@ -232,13 +193,8 @@ def write_slurm_script(
 
 def format_ranges(numbers: Sequence[int]) -> str:
     """Ascending numbers as Slurm's --array has them: 0-3,7."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][1] + 1:
-            parts[-1][1] = number
-        else:
-            parts.append([number, number])
-    return ",".join(f"{first}" if first == last else f"{first}-{last}" for first, last in parts)
+    runs = ([n for _, n in run] for _, run in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0]))
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
 
 
 def format_walltime(span: float) -> str:
@@ -280,7 +236,7 @@ def run_points(
     """
     began, found = clock.monotonic(), SweepOutcome()
     by_name = {point.folder: point for point in manifest.points}
-    waiting = Waiting(manifest, [point for point in manifest.points if point.state != FINISHED])
+    waiting = Waiting(manifest, [point for point in manifest.points if point.state != "finished"])
     changed, written = True, 0.0
     ends_at, least = None, 0.0
     if walltime is not None:
@@ -310,24 +266,24 @@ def run_points(
                 changed, point = True, by_name[name]
                 waiting.compiled(point)
                 if kind == "begun":
-                    point.state, point.message = RUNNING, None
+                    point.state, point.message = "running", None
                     continue
                 if kind == "ended":
                     point.state, point.message, point.ran_sha256 = value["state"], value["message"], value["sha256"]
                     point.seconds += value["seconds"]
                     found.out_of_time |= value["out_of_time"]
                 elif found.signal is None:
-                    point.state, point.message = FAILED, value
+                    point.state, point.message = "failed", value
                 else:  # it was stopped before it sent its end
-                    point.state = INTERRUPTED
+                    point.state = "interrupted"
                     update_state(folder, point)
-                if point.state in (FINISHED, FAILED):
-                    (found.finished if point.state == FINISHED else found.failed).append(name)
+                if point.state in ("finished", "failed"):
+                    (found.finished if point.state == "finished" else found.failed).append(name)
             if changed and clock.monotonic() - written > WRITING_INTERVAL:
                 write_manifest(folder, manifest)
                 changed, written = False, clock.monotonic()
     found.out_of_time |= found.signal is None and bool(waiting)
-    found.left = [point.folder for point in manifest.points if point.state not in (FINISHED, FAILED)]
+    found.left = [point.folder for point in manifest.points if point.state not in ("finished", "failed")]
     write_manifest(folder, manifest)
     found.seconds = clock.monotonic() - began
     return found

@@ -1,5 +1,6 @@
 """The table of a sweep, a line for each combination of values with means and errors over its replicas; its figure."""
 
+import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import nan
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.analysis.source import production_samples
+from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
 from rigidmd.errors import RigidMDError
@@ -16,7 +17,7 @@ from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis
 from rigidmd.io.write import Column, nine_digits, with_error
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
-from rigidmd.studies.sweep.folder import FIGURE, FINISHED, SEED, Manifest, describe_values, short_keys, value_name
+from rigidmd.studies.sweep.folder import FIGURE, SEED, TABLE, Manifest, describe_values, short_keys, value_name
 
 if TYPE_CHECKING:
     import pandas
@@ -31,8 +32,7 @@ MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
 MAIN_OF_BODY = (
     "theta lowest (rad)", "theta highest (rad)", "energy end (J)", "energy_error largest", "L_size_error largest",
 )  # fmt: skip
-#: Short titles for the printed table.
-SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}
+SHORT = {POTENTIAL: "U per molecule (kJ/mol)", DRIFT: "drift (kT/ns/d.o.f.)"}  # short titles for the printed table
 #: Columns of a body that are not in the table; nor are the entries of Q and of the quaternion.
 NOT_OF_BODY = ("time", "orthogonality_error")
 
@@ -127,7 +127,7 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
     for values, points in manifest.combinations():
         row = SweepRow(values)
         for point in points:
-            if point.state != FINISHED:
+            if point.state != "finished":
                 continue
             try:
                 found = summarise_run(read_record(folder / point.folder))
@@ -178,6 +178,16 @@ def _summarise_motion(record: Record) -> dict[str, Measured]:
         figures = {"mean": values.mean(), "lowest": values.min(), "highest": values.max(), "end": values[-1]}
         found |= {f"{name} {word} ({unit})": (float(value), None) for word, value in figures.items()}
     return found
+
+
+def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
+    """The table of the finished points, and the files with table and figure. Raises OutputError."""
+    table = table_of(folder, manifest)
+    if not any(row.runs for row in table.rows):
+        return table, []
+    table.as_columns().write(folder / TABLE, csv.QUOTE_NONNUMERIC)
+    files = [folder / TABLE, write_sweep_figure(table, manifest.name)]
+    return table, [path for path in files if path is not None and path.is_file()]
 
 
 def table_text(table: Table) -> str:

@@ -17,11 +17,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypedDict
 
-from rigidmd.errors import OutputError, RigidMDError
-from rigidmd.studies.sweep.folder import FAILED, FINISHED, INTERRUPTED, SweepPoint, state_on_disk
+from filelock import FileLock, Timeout
 
-#: Number of progress messages of a run.
-PROGRESS_REPORTS = 100
+from rigidmd.core.files import writing
+from rigidmd.errors import OutputError, RigidMDError
+from rigidmd.io.folder import LOCK
+from rigidmd.studies.sweep.folder import State, SweepPoint, state_on_disk
+
+PROGRESS_REPORTS = 100  # number of progress messages of a run
 #: Seconds to wait for a run in the folder of a point that is about to stop: its sweep was killed, or dask moved it.
 LOCK_TIMEOUT = 120.0
 
@@ -40,7 +43,7 @@ class PointTask(TypedDict):
 
 
 class PointResult(TypedDict):
-    state: str
+    state: State
     message: str | None
     sha256: str | None  # scene_sha256 of its summary
     seconds: float
@@ -53,13 +56,13 @@ def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: b
     send : called with ("begun", None) when it is compiled, ("fraction", fraction done), ("announced" or "warned", text)
     """
     began = clock.monotonic()
-    ended: PointResult = {"state": FAILED, "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
+    ended: PointResult = {"state": "failed", "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
     try:
         _run(task, send, progress, ended)
     except RigidMDError as error:
         ended["message"] = str(error)
     except KeyboardInterrupt:
-        ended["state"] = INTERRUPTED
+        ended["state"] = "interrupted"
     except MemoryError:
         ended["message"] = "not enough memory; run fewer points at a time (--jobs)"
     except Exception as error:
@@ -87,8 +90,8 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
     sweep, folder = Path(task["folder"]), Path(task["folder"]) / task["name"]
     wait_for_folder(folder)
     point = SweepPoint(task["name"], {}, task["sha256"], ran_sha256=task["ran_sha256"])
-    if state_on_disk(sweep, point) == FINISHED:
-        ended["state"], ended["sha256"] = FINISHED, task["ran_sha256"]
+    if state_on_disk(sweep, point) == "finished":
+        ended["state"], ended["sha256"] = "finished", task["ran_sha256"]
         return
     walltime = None if task["ends_at"] is None else max(0.0, task["ends_at"] - clock.time())
     observers: list[Observer] = [Begun()]
@@ -102,25 +105,20 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
         warn=lambda sentence: send("warned", sentence), resume=resume, walltime=walltime,
     )  # fmt: skip
     results = simulation.run(progress=progress)
-    ended["state"] = INTERRUPTED if results.interrupted else FINISHED
+    ended["state"] = "interrupted" if results.interrupted else "finished"
     ended["sha256"] = None if results.interrupted else results.summary["scene_sha256"]
     ended["out_of_time"] = results.out_of_time
 
 
 def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
     """Wait until no other run writes in a folder. Raises OutputError after the timeout."""
-    from filelock import FileLock, Timeout
-
-    from rigidmd.io.folder import LOCK
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / LOCK, timeout=timeout):
-            pass
-    except Timeout:
-        raise OutputError(f"another run is writing in {folder}, and did not end within {timeout:g} s") from None
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror}") from None
+    with writing(folder):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder / LOCK, timeout=timeout):
+                pass
+        except Timeout:
+            raise OutputError(f"another run is writing in {folder}, and did not end within {timeout:g} s") from None
 
 
 def main() -> None:
