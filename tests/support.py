@@ -261,7 +261,7 @@ HOMES = {
     "studies.sweep.sweeping": "Waiting code_kind format_ranges format_walltime run_points write_slurm_script",
     "view.animation": "write_film",
     "view.body_animation": "BodyAnimation",
-    "core.shipped": "CHAPTERS DOCS find_example notebooks",
+    "core.shipped": "CHAPTERS DOCS NOTEBOOKS examples_in find_example",
     "analysis.result": "Curve AnalysisResult Value converged_value",
     "analysis.rigid_frames": "_without_rounding fit_frames frames_of_folder steady_from",
     "io.formats.bonds": "bonds connections",

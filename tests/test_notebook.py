@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from support import ROOT, SYSTEMS, live_plot, notebooks, progress, save_figure, small_scene
+from support import NOTEBOOKS, ROOT, SYSTEMS, examples_in, live_plot, progress, save_figure, small_scene
 
 import rigidmd
 from rigidmd.commands.cli import main
@@ -253,7 +253,7 @@ def test_without_chemiscope_one_sentence_says_so(monkeypatch):
 
 def test_the_tutorial_is_listed_copied_and_has_no_outputs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert [example.name for example in notebooks()] == ["tutorial"]
+    assert [example.name for example in examples_in(NOTEBOOKS)] == ["tutorial"]
     assert main(["examples"]) == 0
     listed = capsys.readouterr().out
     assert re.search(r"^notebooks:\n  tutorial +A heavy top", listed, re.MULTILINE)

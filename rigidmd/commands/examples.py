@@ -7,14 +7,14 @@ from rigidmd.commands.arguments import command
 
 @command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
 def _examples(options: argparse.Namespace) -> int:
-    from rigidmd.core.shipped import examples, notebooks, scripts
+    from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples, examples_in
 
     scenes = examples()
     kinds = {
         "molecules": [example for example in scenes if not example.is_body],
         "one body": [example for example in scenes if example.is_body],
-        "notebooks": notebooks(),
-        "scripts, which extend it": scripts(),
+        "notebooks": examples_in(NOTEBOOKS),
+        "scripts, which extend it": examples_in(SCRIPTS),
     }
     width = max(len(example.name) for example in scenes)
     for title, found in kinds.items():

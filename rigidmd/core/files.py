@@ -49,10 +49,8 @@ def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and removed when it fails.
-
-    A link at `path` is replaced; its target is not changed.
-    """
+    """A temporary path in the folder of `path`, renamed to `path` when the block succeeds and removed when it fails. A
+    link at `path` is replaced; its target is not changed."""
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
     with writing(path):
         temporary.touch(exist_ok=False)  # with the permissions of any new file
@@ -108,12 +106,9 @@ class AppendedFile:
             elif path.is_symlink() or (reason := unreadable_reason(path)):
                 raise OutputError(f"{path}: {'is a link' if path.is_symlink() else reason}; the run cannot continue it")
             self._file = os.fdopen(os.open(path, APPEND_FLAGS), "r+b", buffering=0)
-            if kept is not None:
-                try:
-                    self._check(*patched)
-                except OutputError:
-                    self._file.close()
-                    raise
+            if why := "" if kept is None else self._difference(*patched):
+                self._file.close()
+                raise OutputError(f"{path} {why}")
 
     def cut(self) -> None:
         """Remove everything that was appended after the time of `kept`."""
@@ -151,17 +146,16 @@ class AppendedFile:
         with writing(self._path):
             self._file.close()
 
-    def _check(self, offset: int, first: bytes) -> None:
-        """Compare the file with its size and checksum."""
+    def _difference(self, offset: int, first: bytes) -> str:
+        """How the file differs from its size and checksum; empty if it does not."""
         found, left = 0, self._size
         while left and (piece := bytearray(self._file.read(min(left, CHUNK)))):
             if left == self._size:
                 piece[offset : offset + len(first)] = first
             found, left = zlib.crc32(piece, found), left - len(piece)
         if left:
-            raise OutputError(f"{self._path} is shorter than it was: {self._size} bytes are needed to continue it")
-        if found != self._sum:
-            raise OutputError(f"{self._path} has changed or is damaged: its checksum has changed")
+            return f"is shorter than it was: {self._size} bytes are needed to continue it"
+        return "" if found == self._sum else "has changed or is damaged: its checksum has changed"
 
     def _write(self, piece: bytes) -> None:
         rest = memoryview(piece)

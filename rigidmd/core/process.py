@@ -1,7 +1,6 @@
 """Settings and memory of the process, which runs in several threads share."""
 
 import contextlib
-import importlib
 import threading
 import warnings
 from collections.abc import Iterator
@@ -21,23 +20,19 @@ def ignore_warnings() -> Iterator[None]:
         yield
 
 
-resource = None
-with contextlib.suppress(ImportError):  # not on Windows
-    resource = importlib.import_module("resource")
+try:
+    import resource
+except ImportError:  # on Windows
+    resource = None
 #: Fraction of the free memory that is reserved for Python, machine code and files.
 RESERVED = 0.05
 
 
 def free_memory() -> float:
     """Free bytes of this machine, within the limits of container and process; infinite where the system has no data."""
-    free = _system_number("/proc/meminfo", "MemAvailable:") * 1024
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-    ):
-        free = min(
-            free, _system_number(f"/sys/fs/cgroup/{limit}") - min(_system_number(f"/sys/fs/cgroup/{used}"), 1e18)
-        )
+    free, group = _system_number("/proc/meminfo", "MemAvailable:") * 1024, "/sys/fs/cgroup/memory"
+    for limit, used in ((".max", ".current"), ("/memory.limit_in_bytes", "/memory.usage_in_bytes")):
+        free = min(free, _system_number(f"{group}{limit}") - min(_system_number(f"{group}{used}"), 1e18))
     return max(0.0, min(free, address_space_left()))
 
 

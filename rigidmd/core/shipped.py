@@ -10,18 +10,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from rigidmd.core.files import atomic_file
+from rigidmd.core.files import atomic_file, writing
 from rigidmd.errors import InputError, OutputError
 
 PACKAGE = Path(__file__).parent.parent
 #: In a wheel the scenes are inside the package; in a checkout or an editable install they are next to it.
 SYSTEMS = next(path for path in (PACKAGE / "systems", PACKAGE.parent / "systems") if path.is_dir())
 DOCS = PACKAGE / "docs"
-NOTEBOOK, SCRIPT = ".ipynb", ".py"
+NOTEBOOKS, SCRIPTS = "notebooks/*.ipynb", "scripts/*.py"
 #: Shipped files in the chapters: stem, extension.
 _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
 #: Kind of an example by the extension of its file.
-KINDS = {".toml": "scene", NOTEBOOK: "notebook", SCRIPT: "script"}
+KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
 #: In the order of the list.
 CHAPTERS = (
     "top", "water", "molecule", "ensembles", "looking", "notebook", "measuring", "studies", "ase", "engines",
@@ -44,33 +44,24 @@ class Example(NamedTuple):
 
 def examples() -> list[Example]:
     """The shipped scenes, sorted by name; numbers within names are sorted by value."""
-    found = _examples(SYSTEMS.glob("*.toml"))
+    found = examples_in("*.toml")
     return sorted(found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)])
 
 
-def notebooks() -> list[Example]:
-    """The shipped notebooks, sorted by name."""
-    return _examples((SYSTEMS / "notebooks").glob(f"*{NOTEBOOK}"))
-
-
-def scripts() -> list[Example]:
-    """The shipped scripts, each an extension, sorted by name."""
-    return _examples((SYSTEMS / "scripts").glob(f"*{SCRIPT}"))
-
-
-def _examples(paths: Iterable[Path]) -> list[Example]:
+def examples_in(files: str) -> list[Example]:
+    """The shipped examples among these files, such as notebooks/*.ipynb or scripts/*.py, sorted by name."""
     found = []
-    for path in sorted(paths):
+    for path in sorted(SYSTEMS.glob(files)):
         text = path.read_text(encoding="utf-8")
         is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
-        first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == NOTEBOOK else text
+        first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
         found.append(Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body))
     return found
 
 
 def find_example(name: str) -> Example:
     """The example of this name, or the first scene of a numbered series of this name. Raises InputError."""
-    known = {example.name: example for example in [*examples(), *notebooks(), *scripts()]}
+    known = {example.name: example for example in [*examples(), *examples_in(NOTEBOOKS), *examples_in(SCRIPTS)]}
     if name in known:
         return known[name]
     if series := series_of(name):
@@ -99,12 +90,10 @@ def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path]
         if target.exists() and not force and not kept:
             raise OutputError(f"{target} exists; --force replaces it, -o names another file")
     for target, source in {path: example.path, **inputs}.items():
-        try:
+        with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             with atomic_file(target) as temporary:
                 shutil.copyfile(source, temporary)
-        except OSError as error:
-            raise OutputError(f"{target} cannot be written: {error.strerror}") from None
     return [path, *inputs]
 
 
@@ -116,8 +105,7 @@ def contents() -> dict[str, str]:
 def chapter_text(name: str) -> str:
     """A chapter as plain text, without comments; pictures become name and path. Raises InputError."""
     if name not in CHAPTERS:
-        near = difflib.get_close_matches(name, CHAPTERS, 1, 0.6)
-        hint = f"did you mean {near[0]}? " if near else ""
+        hint = "".join(f"did you mean {near}? " for near in difflib.get_close_matches(name, CHAPTERS, 1, 0.6))
         word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
         found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
         named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
@@ -135,12 +123,10 @@ def _plain(name: str) -> str:
     if copied:
         files = textwrap.fill(", ".join(f"{stem}{extension}" for stem, extension in copied), 120)
         title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
-    text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", _picture, _SHIPPED.sub(r"\1\2", text))
+
+    def picture(found: re.Match) -> str:
+        about, up, path = found.groups()
+        return f"[picture: {about}{f', {path}' if (DOCS / up / path).is_file() else ''}]"
+
+    text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", picture, _SHIPPED.sub(r"\1\2", text))
     return f"{title}\n{text}".rstrip()
-
-
-def _picture(found: re.Match) -> str:
-    """A picture as plain text: its name, and its path if the file exists."""
-    about, up, path = found.groups()
-    there = (DOCS / up / path).is_file()
-    return f"[picture: {about}{f', {path}' if there else ''}]"

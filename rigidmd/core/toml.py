@@ -74,10 +74,8 @@ def plain_values(data: Any, depth: int = 0) -> Any:
 
 
 def impossible_values(data: Any) -> list[tuple[list, str]]:
-    """Values that are not allowed in any table, each with its path of keys and what is wrong with it.
-
-    These are tables deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with unprintable characters.
-    """
+    """Values that are not allowed in any table, each with its path of keys and what is wrong with it. These are tables
+    deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with unprintable characters."""
     found: list[tuple[list, str]] = []
     rest: list[tuple[list, Any]] = [([], data)]
     while rest:
@@ -87,20 +85,15 @@ def impossible_values(data: Any) -> list[tuple[list, str]]:
                 return [(keys[:DEEPEST], f"has lists or tables more than {DEEPEST} deep")]
             case dict():
                 rest += [([*keys, key], inner) for key, inner in value.items()]
-                found += [
-                    ([*keys, key], "has a control character in its name") for key in value if _is_unprintable(key)
-                ]
+                odd = [key for key in value if isinstance(key, str) and UNPRINTABLE.search(key)]
+                found += [([*keys, key], "has a control character in its name") for key in odd]
             case list() | tuple():
                 rest += [([*keys, k], inner) for k, inner in enumerate(value)]
             case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
                 found.append((keys, "is a whole number of more than 64 bits"))
-            case str() if _is_unprintable(value):
+            case str() if UNPRINTABLE.search(value):
                 found.append((keys, f"is {shorten_repr(value)}: control characters are not allowed"))
     return found
-
-
-def _is_unprintable(text: Any) -> bool:
-    return isinstance(text, str) and UNPRINTABLE.search(text) is not None
 
 
 def shorten_text(text: str, most: int = 80) -> str:
