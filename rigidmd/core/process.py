@@ -24,8 +24,7 @@ try:
     import resource
 except ImportError:  # on Windows
     resource = None
-#: Fraction of the free memory that is reserved for Python, machine code and files.
-RESERVED = 0.05
+RESERVED = 0.05  # fraction of the free memory that is reserved for Python, machine code and files
 
 
 def free_memory() -> float:

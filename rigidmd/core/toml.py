@@ -15,8 +15,7 @@ from rigidmd.errors import UNPRINTABLE, InputError
 #: Largest TOML file in bytes. Reading takes a second per megabyte; a molecule of 10,000 sites has one megabyte.
 LARGEST = 4_000_000
 DEEPEST = 32  # levels of nested tables and lists; scenes need six
-#: Whole numbers in TOML have 64 bits.
-LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1
+LEAST_WHOLE, LARGEST_WHOLE = -(2**63), 2**63 - 1  # whole numbers in TOML have 64 bits
 
 _LONG_KEY = re.compile(rf"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}")
 
