@@ -3,8 +3,6 @@
 import re
 from collections.abc import Sequence
 
-from rigidmd.errors import OutputError
-
 #: Line ends, control characters and characters that Slurm interprets within quotes: not allowed in paths of scripts.
 UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
 
@@ -29,13 +27,3 @@ def distinct(texts: Sequence[str]) -> list[str]:
             name, n = f"{stem}_{n + 1}", n + 1
         found.append(name)
     return found
-
-
-def check_script_paths(paths: Sequence[str]) -> None:
-    """Raise OutputError if a path cannot be written into a job script."""
-    for path in paths:
-        if UNSAFE.search(path):
-            raise OutputError(
-                f"{path!r} has a control character, a quotation mark or a backslash in its name, which the script of a "
-                "job cannot have; rename it, or name another folder with -o"
-            )

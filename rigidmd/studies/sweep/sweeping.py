@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
-from rigidmd.core.plain_text import as_word, check_script_paths, in_comment
+from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
@@ -178,7 +178,11 @@ def write_slurm_script(
     words = ["rigidmd", "sweep", manifest.scene, "-o", str(folder.absolute())]
     words += [word for trusted in trust for word in ("--trust", str(Path(trusted).absolute()))]
     here = str(Path.cwd())
-    check_script_paths([*words, str(path), here])
+    if unsafe := [text for text in (*words, str(path), here) if UNSAFE.search(text)]:
+        raise OutputError(
+            f"{unsafe[0]!r} has a control character, a quotation mark or a backslash in its name, which the script of "
+            "a job cannot have; rename it, or name another folder with -o"
+        )
     text = SLURM_SCRIPT.format(
         count=len(left), name=in_comment(manifest.name), job=f"{as_word(manifest.name)}-sweep",
         array=format_ranges(left), threads=threads, time=format_walltime(walltime),
