@@ -136,10 +136,9 @@ def ase_results(
 
     atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
-    still = state._replace(
-        velocity=np.zeros_like(state.velocity), angular_momentum_body=np.zeros_like(state.angular_momentum_body)
-    )
-    seen = observe(system, engine, still, energy_unit=EV)
+    velocity, momentum = np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body)
+    at_rest = state._replace(velocity=velocity, angular_momentum_body=momentum)
+    seen = observe(system, engine, at_rest, energy_unit=EV)
     load, torque = seen.load, np.zeros_like(seen.load.force)
     if len(state.rotation):
         torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
@@ -253,9 +252,8 @@ def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
     if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(molecule.radius, 1.0):
         return weight[:, None, None] * np.eye(3)
     totals = np.hstack([np.vstack([np.eye(3), _cross(x)]) for x in heavy])
-    return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ np.vstack([np.eye(3), _cross(position)])).reshape(
-        -1, 3, 3
-    )
+    of_site = np.vstack([np.eye(3), _cross(position)])
+    return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ of_site).reshape(-1, 3, 3)
 
 
 def _cross(x: np.ndarray) -> np.ndarray:

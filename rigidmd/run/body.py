@@ -91,10 +91,8 @@ class BodyWatch(Observer):
     def __init__(self, run: "Simulation"):
         self._run, self._system, self._limits = run, run.system, run.scene.watch
         system, every = run.system, max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
-        # at most half a second of computing
-        self.steps = min(
-            EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1), SAMPLES_PER_CHECK * every
-        )
+        most = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)  # half a second of computing
+        self.steps = min(most, SAMPLES_PER_CHECK * every)
         self._start = self._energies(system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)

@@ -36,12 +36,10 @@ def coulomb_errors(system: System, state: State, size: float = 1.0) -> dict[str,
     """Errors of a system's Ewald sums at a state, of forces on sites and of the energy, compared with a more accurate
     sum: the entry `accuracy` of `rigidmd energy`, with energies in a unit of `size` u Å²/ps². Raises SceneError if it
     has no Ewald sums."""
-    scene = system.scene
+    scene, method = system.scene, system.scene.forces.electrostatics
     if system.force_error is None:
-        method = scene.forces.electrostatics
-        raise SceneError(
-            scene.source, [f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"]
-        )
+        problem = f"--accuracy needs Ewald sums; forces.electrostatics is {method!r}, or no site has a charge"
+        raise SceneError(scene.source, [problem])
     accuracy = max(REFERENCE_ERROR * system.force_error / COULOMB, MIN_REFERENCE_ERROR)
     settings = ("ewald_alpha_per_A", "ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A", "pme_order", "pme_grid")
     changes = dict.fromkeys(settings) | {"electrostatics": "ewald", "ewald_accuracy": accuracy}
@@ -65,9 +63,8 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charged = [m.charges != 0 for m in system.species]
-    charges = charges_of(
-        [(int(n), m.charges[c], m.positions_body[c]) for n, m, c in zip(counts, system.species, charged, strict=True)]
-    )
+    species = zip(counts, system.species, charged, strict=True)
+    charges = charges_of([(int(n), m.charges[c], m.positions_body[c]) for n, m, c in species])
     if isinstance(term, EwaldSum):
         reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
     else:

@@ -62,10 +62,9 @@ class RunLoop:
         minutes = simulation.scene.output.checkpoint_minutes
         self.checkpoints = CheckpointSchedule(simulation.folder, minutes, deadline)
         self.process = os.getpid()
-        self.interrupted = self.out_of_time = False
+        self.interrupted, self.out_of_time, self.advanced = False, False, 0
         self.signal: int | None = None
         self.results: Results | None = None
-        self.advanced = 0
         self._error: Exception | None = None  # of an observer
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False

@@ -309,7 +309,7 @@ class _Descent:
         if found is None and self._memory:
             self._memory.clear()
             self._fraction = FIRST_MOVE
-            found = self._along(point, self._direction(point.gradient))
+            return self.step(point)
         if found is None:
             return None
         move, other = found

@@ -1,6 +1,7 @@
 """The part of a simulation that depends on the kind of its system; `molecular` and `body` implement it."""
 
 from math import isclose
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from rigidmd.core.integrators import SCHEMES
@@ -36,7 +37,7 @@ class RunPart:
     engine_version = "rigidmd"
     threads: Any = 1
 
-    system: Any  # its scene is the scene of the run
+    system: Any
     engine: Any
     state: State
     record: Any
@@ -45,12 +46,10 @@ class RunPart:
     reenter_segment: Any
     time_unit: str
 
+    scene: Any = property(attrgetter("system.scene"))
+
     def __init__(self, simulation: "Simulation"):
         self.simulation = simulation
-
-    @property
-    def scene(self) -> Any:
-        return self.system.scene
 
     def take_threads(self, count: int) -> None:
         """Set the number of threads; a single body always has one."""

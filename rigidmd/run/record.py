@@ -94,11 +94,10 @@ def read_record(folder: Path) -> Record:
     check_is_run(folder)
     scene = Scene.read(folder / SCENE)
     summary, missing = read_json(folder / SUMMARY, Summary), []
+    resume = f"`rigidmd resume {shlex.quote(str(folder))}` continues it"
     if summary is None:
-        missing.append(
-            f"This run has not ended: there is no {SUMMARY}. These are its results so far; "
-            f"`rigidmd resume {shlex.quote(str(folder))}` continues it."
-        )
+        ended = f"This run has not ended: there is no {SUMMARY}"
+        missing.append(f"{ended}. These are its results so far; {resume}.")
     elif summary.interrupted:
         missing.append("This run was interrupted; these are its results so far.")
     if isinstance(scene, BodyScene):
@@ -108,9 +107,7 @@ def read_record(folder: Path) -> Record:
         system = build(scene, user_code=False)
         columns = _log(folder, scene.stages)
     if not columns or len(next(iter(columns.values()))) == 0:
-        raise OutputError(
-            f"{folder}: the run has not written samples yet; `rigidmd resume {shlex.quote(str(folder))}` continues it"
-        )
+        raise OutputError(f"{folder}: the run has not written samples yet; {resume}")
     return Record(folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing)
 
 
@@ -121,9 +118,8 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
     headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
     if lacking := [name for name in ("time", "stage_name") if name not in headers]:
-        raise OutputError(
-            f"{read.path} is not a log of rigidmd: it has no column {samples.COLUMNS[lacking[0]].header!r}"
-        )
+        header = samples.COLUMNS[lacking[0]].header
+        raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
     found = {
         name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
         for name, header in headers.items()

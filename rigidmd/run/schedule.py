@@ -65,8 +65,6 @@ def checked_walltime(seconds: float) -> float:
 class CheckpointSchedule:
     """Writes the checkpoints of a run.
 
-    Parameters
-    ----------
     folder : of the run; None: no checkpoints
     minutes : wall time between checkpoints; False: no checkpoints
     deadline : `time.monotonic()` before which the run has to end, or None

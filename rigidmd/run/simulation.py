@@ -54,8 +54,6 @@ def _as_warning(sentence: str) -> None:
 class Simulation(Displayed):
     """A scene, ready to run: `run()` runs it to its end, `step(n)` advances it by n steps; both can be mixed.
 
-    Parameters
-    ----------
     scene : the scene
     folder : folder for the files; None writes nothing and keeps the frames in memory
     force : replace an earlier run in that folder

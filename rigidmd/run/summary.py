@@ -125,9 +125,8 @@ def _common_drift_notes(system: System, state: State, last: Sample) -> list[str]
     gain = 2 * energy / system.freedom.translation
     if gain <= COMMON_DRIFT_LIMIT * last.temperature_translation:
         return []
-    return [
-        f"{together}, which adds {gain:.2g} K to T_trans; run.remove_momentum_interval_ps removes the total momentum"
-    ]
+    remedy = "run.remove_momentum_interval_ps removes the total momentum"
+    return [f"{together}, which adds {gain:.2g} K to T_trans; {remedy}"]
 
 
 def ewald_error_notes(system: System, state: State) -> list[str]:
@@ -293,9 +292,8 @@ def summarise_body(
     angles = np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist() if system.rotates else None
     notes = system.notes
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
-        notes.append(
-            f"the energy is wrong by {error:.1e} of the largest kinetic energy: timestep_s is too long for this motion"
-        )
+        wrong = f"the energy is wrong by {error:.1e} of the largest kinetic energy"
+        notes.append(f"{wrong}: timestep_s is too long for this motion")
     if system.rotates:
         speed = np.sqrt(sum(motion[f"omega_body_{k}"] ** 2 for k in (1, 2, 3)))
         if (speed[1:] * np.diff(motion["time"])).max(initial=0.0) > np.pi:
