@@ -33,6 +33,7 @@ SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
+OMEGA = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 #: Lines with more points are rasterised in the SVG; level at which an error of exactly 0 is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
@@ -71,7 +72,11 @@ def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
         if steady and "L_size" in samples.invariants and np.min(system.inertia) > 0:
             figures["ellipsoids"] = _ellipsoids_figure(columns, np.asarray(system.inertia, float))
         else:
-            figures["omega"] = _omega_figure(columns)
+            omega = [columns[f"omega_body_{i}"] for i in "123"]
+            fastest = max(np.abs(part).max() for part in omega)
+            figures["omega"] = figure = new_figure(8, 6.4, title="ω in the body frame")
+            cells, span = figure.add_gridspec(3, 1), 2 * fastest or 1.0
+            _draw_series(figure, cells, columns["time"], omega, OMEGA, 1e-9 * fastest, span)
     if system.translates:
         figures["path"] = _path_figure(columns, down)
     figures["invariants"] = _invariants_figure(columns, samples.invariants)
@@ -181,19 +186,8 @@ def _ellipsoids_figure(columns: dict[str, np.ndarray], inertia: np.ndarray):
         _draw_path(axis, omega, view, depth, half, centre, INK)
         _triad(axis, view, ("ω₁", "ω₂", "ω₃"))
         axis.set_title(title, **NOTE)
-    labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
-    _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, labels, 1e-9 * fastest, 2 * fastest)
+    _draw_series(figure, cells[:, -1].subgridspec(3, 1), time, omega.T, OMEGA, 1e-9 * fastest, 2 * fastest)
     _label_start(figure)
-    return figure
-
-
-def _omega_figure(columns: dict[str, np.ndarray]):
-    """ω in the body frame against time, for a body with other motion than a free one."""
-    omega = [columns[f"omega_body_{i}"] for i in "123"]
-    fastest = max(np.abs(part).max() for part in omega)
-    figure = new_figure(8, 6.4, title="ω in the body frame")
-    labels = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
-    _draw_series(figure, figure.add_gridspec(3, 1), columns["time"], omega, labels, 1e-9 * fastest, 2 * fastest or 1.0)
     return figure
 
 

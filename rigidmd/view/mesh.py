@@ -52,7 +52,19 @@ def mesh_of(system: BodySystem) -> Mesh:
         return _solid_mesh(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
     if wanted is None and table.solid is not None:
         return _solid_mesh(table.solid, centre)
-    return _equal_inertia_mesh(wanted, mass, inertia_at_centre(scene), centre, table.pinned)
+    # a homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid
+    tensor = inertia_at_centre(scene)
+    if not tensor.any():
+        return BALL._replace(about="a ball, as it is a point")
+    moments, axes = principal(tensor)
+    symmetric = axis_of_symmetry(moments)
+    if wanted in (None, "top") and symmetric is not None:
+        return _top_mesh(mass, moments, axes, symmetric, centre, table.pinned)
+    lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
+    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
+    if wanted != "ellipsoid":
+        lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
+    return unit._replace(vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}")
 
 
 def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
@@ -62,21 +74,6 @@ def _solid_mesh(solid: Solid, position: np.ndarray) -> Mesh:
     unit = UNITS.get(solid.shape, BALL)
     about = f"{'an' if solid.shape[0] in 'aeiou' else 'a'} {solid.shape}"
     return unit._replace(vertices=unit.vertices * np.maximum(size, MIN_THICKNESS * size.max()) + position, about=about)
-
-
-def _equal_inertia_mesh(wanted: str | None, mass: float, tensor: np.ndarray, centre: np.ndarray, pinned: bool) -> Mesh:
-    """A homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid."""
-    if not tensor.any():
-        return BALL._replace(about="a ball, as it is a point")
-    moments, axes = principal(tensor)
-    symmetric = axis_of_symmetry(moments)
-    if wanted in (None, "top") and symmetric is not None:
-        return _top_mesh(mass, moments, axes, symmetric, centre, pinned)
-    lengths = np.sqrt(np.maximum(2.5 / mass * (moments.sum() - 2 * moments), 0.0))  # half axes of the ellipsoid
-    lengths, unit, shape = np.maximum(lengths, MIN_THICKNESS * lengths.max()), BALL, "ellipsoid"
-    if wanted != "ellipsoid":
-        lengths, unit, shape = CUBOID_EDGES * lengths, CUBOID, "cuboid"
-    return unit._replace(vertices=(unit.vertices * lengths) @ axes.T + centre, about=f"the {shape} {EQUAL}")
 
 
 def _top_mesh(

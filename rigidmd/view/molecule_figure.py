@@ -118,7 +118,9 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     check_target(path, EXTENSIONS, force, "figure")
     view = _view(m)
     seen: Any = m.positions_body @ view.T  # right, up, towards the viewer
-    radius: Any = np.array([_radius(m, i) for i in range(len(m.masses))])
+    covalent = np.array([COVALENT.get(element, 0.0) for element in m.elements])
+    radius: Any = np.maximum(LEAST, np.where(covalent > 0, OF_COVALENT * covalent, OF_DIAMETER * m.sigma))
+    radius[m.masses == 0] = LEAST / 2
     reach = np.maximum(radius, np.where(m.epsilon > 0, m.sigma / 2, 0.0))
     half = float(1.12 * (np.abs(seen[:, :2]).max(axis=1) + reach).max())
     figure = new_figure(INCHES, INCHES * 1.12, layout=None)
@@ -159,13 +161,6 @@ def _view(m: Molecule) -> np.ndarray:
     about_up = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     forward = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     return forward @ about_up
-
-
-def _radius(m: Molecule, i: int) -> float:
-    if m.masses[i] == 0:
-        return LEAST / 2
-    covalent = COVALENT.get(m.elements[i])
-    return max(LEAST, OF_COVALENT * covalent if covalent else OF_DIAMETER * m.sigma[i])
 
 
 def _colour(m: Molecule, i: int) -> str:
