@@ -8,14 +8,6 @@ of compiling for the forty arrays of a term, and every call would run all of it.
 import contextlib
 import ctypes
 import hashlib
-import importlib
-import os
-import pickle
-import subprocess
-import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,10 +23,9 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
 
 from rigidmd.compile import thread_pool
-from rigidmd.compile.cache import cache_folder, is_persistent
-from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options, kernel
-from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
-from rigidmd.errors import SettingError
+from rigidmd.compile.cache import cache_folder
+from rigidmd.compile.kernels import chosen_by_type, compile_callback, compiler_options
+from rigidmd.compile.machine import cast_pointer, pointer_to
 
 # --- values in memory ------------------------------------------------------------------------------------------------
 
@@ -42,12 +33,8 @@ from rigidmd.errors import SettingError
 C_TYPES = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.float32: ctypes.c_float} | {
     kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64
 }
-
-
-class AddressType(types.Type):
-    """Base of types whose values are 64-bit integers in compiled code: the `address_value` of the Python object."""
-
-    bitwidth = 64
+#: Longest time to wait for the code of another process, s.
+LONGEST_WAIT = 120.0
 
 
 class NumbaStruct:
@@ -71,7 +58,7 @@ def _c_value(kind: types.Type, value: Any) -> Any:
     if isinstance(kind, types.BaseTuple):
         parts = [_c_value(*pair) for pair in zip(kind.types, value, strict=True)]
         return _struct(tuple((f"item_{k}", type(part)) for k, part in enumerate(parts)))(*parts)
-    if isinstance(kind, AddressType):
+    if isinstance(kind, CodeType):
         return ctypes.c_int64(value.address_value)
     if kind is types.none:
         return ctypes.c_void_p()
@@ -147,33 +134,21 @@ class CompiledTask:
         self.function, self.options = function, options
         self.compiled = {}
 
-    @property
-    def name(self) -> tuple[str, str]:
-        """Its module, and its name in that module."""
-        return self.function.__module__, self.function.__name__
-
     def address(self, arguments_type: TaskArguments) -> int:
         """Address of the machine code for arguments of this type, which is compiled or read from the cache.
 
         Processes that need the same code compile it once: the others wait, and read it from the cache.
         """
-        if not self.is_ready(arguments_type):
-            digest = hashlib.sha256(repr((self.name, arguments_type)).encode()).hexdigest()[:16]
+        if arguments_type not in self.compiled:
+            thread_pool.start_workers()
+            name = self.function.__module__, self.function.__name__, arguments_type
+            digest = hashlib.sha256(repr(name).encode()).hexdigest()[:16]
             with contextlib.ExitStack() as held:
                 with contextlib.suppress(OSError, Timeout):
                     held.enter_context(FileLock(Path(cache_folder()) / f"{digest}.lock", timeout=LONGEST_WAIT))
                 code = compile_callback(self.function, (arguments_type, types.intp), self.options)
             self.compiled.setdefault(arguments_type, code)  # the code of another thread may already be in use
         return self.compiled[arguments_type].address
-
-    def is_ready(self, arguments_type: TaskArguments) -> bool:
-        """Whether `address` has nothing to compile. Code in the cache is read."""
-        if arguments_type not in self.compiled:
-            thread_pool.start_workers()
-            with contextlib.suppress(NotStored):
-                code = compile_callback(self.function, (arguments_type, types.intp), self.options, stored_only=True)
-                self.compiled.setdefault(arguments_type, code)
-        return arguments_type in self.compiled
 
 
 def task(*, count_references=True):
@@ -189,11 +164,7 @@ class Code:
 
     def __init__(self, **tasks: tuple[CompiledTask, object]):
         kinds = {name: TaskArguments(numba.typeof(content)) for name, (_, content) in tasks.items()}
-        pairs = [(tasks[name][0], kind) for name, kind in kinds.items()]
-        collected = _collected.get()
-        if collected is not None:
-            collected.extend(pairs)
-        self._addresses = np.array([one.address(kind) if collected is None else 0 for one, kind in pairs], np.uintp)
+        self._addresses = np.array([tasks[name][0].address(kind) for name, kind in kinds.items()], np.uintp)
         self.address_value = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(kinds.items()))
         self._names = list(tasks)
@@ -210,8 +181,10 @@ class Code:
         return struct
 
 
-class CodeType(AddressType):
-    """Numba type of a `Code`: its tasks, and the type of arguments that each accepts."""
+class CodeType(types.Type):
+    """Numba type of a `Code`: its tasks, and the type of arguments that each accepts. Its value is `address_value`."""
+
+    bitwidth = 64
 
     def __init__(self, task_types: tuple[tuple[str, TaskArguments], ...]):
         self.task_types = task_types
@@ -288,14 +261,6 @@ class BoundTask:
         self._function(self._content.address, 0)
 
 
-@kernel
-def _call_blocks_at(address, task_arguments, blocks):
-    if blocks == 1:
-        thread_pool.call_address(address, task_arguments, 0)
-    else:
-        thread_pool.run_on_all_threads(address, task_arguments, blocks)
-
-
 @chosen_by_type(inline=True, prefer_literal=True)
 def call(code, name, task_arguments):
     """Call a task for block 0 by its name, a literal. Arguments of another type are a compilation error."""
@@ -307,80 +272,12 @@ def call(code, name, task_arguments):
 @chosen_by_type(inline=True, prefer_literal=True)
 def call_blocks(code, name, task_arguments, blocks):
     """Call a task for every block; on all threads if there are several blocks."""
-    return lambda code, name, task_arguments, blocks: _call_blocks_at(
-        address_of(code, name, task_arguments), task_arguments, blocks
-    )
 
+    def call_blocks(code, name, task_arguments, blocks):
+        address = address_of(code, name, task_arguments)
+        if blocks == 1:
+            thread_pool.call_address(address, task_arguments, 0)
+        else:
+            thread_pool.run_on_all_threads(address, task_arguments, blocks)
 
-# --- two processes that compile --------------------------------------------------------------------------------------
-
-#: Held while codes are compiled together: of several runs at once, one compiles and the others read its result.
-_compiling = threading.RLock()
-#: Tasks of each `Code` while they are only collected and not compiled, in this thread; None otherwise.
-_collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar("collected", default=None)
-#: Least number of tasks for a second process; for fewer, importing the package there takes longer.
-FEWEST_TASKS = 3
-#: Longest time to wait for the code of another process, s.
-LONGEST_WAIT = 120.0
-#: Program of the second process, which finds the package with the same search path.
-SECOND_PROGRAM = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from rigidmd.compile import code; code.compile_requested()"
-)  # fmt: skip
-
-
-def compiler_processes() -> int:
-    """Number of processes that compile: `RIGIDMD_COMPILERS`, 1 or 2; default: 2."""
-    named = os.environ.get("RIGIDMD_COMPILERS", "2")
-    if named not in ("1", "2"):
-        raise SettingError(f"RIGIDMD_COMPILERS is {named[:40]!r}, must be 1 or 2")
-    return int(named) if MOST_THREADS > 1 and sys.executable and is_persistent() else 1
-
-
-def compile_together(make: Callable[[], object]) -> None:
-    """Compile every `Code` that a function makes, in two processes if that saves time.
-
-    Python and LLVM compile one function at a time per process. A second process begins with the last task, and this one
-    with the first. The function is first called only to collect the tasks and types of its codes. These have no
-    addresses, so it must not call them.
-    """
-    if compiler_processes() == 1:
-        return
-    with _compiling:
-        collected: list[tuple[CompiledTask, TaskArguments]] = []
-        before = _collected.set(collected)
-        try:
-            make()
-        finally:
-            _collected.reset(before)
-        missing = [(*one.name, kind) for one, kind in dict.fromkeys(collected) if not one.is_ready(kind)]
-        if len(missing) >= FEWEST_TASKS:
-            with second_process(missing):
-                make()
-
-
-@contextlib.contextmanager
-def second_process(wanted: Sequence[tuple[str, str, TaskArguments]]) -> Iterator[None]:
-    """Within the block a second process compiles tasks (module, name, type), unless their types cannot be pickled."""
-    process = None
-    with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
-        content = pickle.dumps(sys.path) + pickle.dumps(wanted)
-        process = subprocess.Popen(
-            [sys.executable, "-c", SECOND_PROGRAM], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C goes to this process, which then ends the other
-        )  # fmt: skip
-        assert process.stdin is not None
-        process.stdin.write(content)
-        process.stdin.close()
-    try:
-        yield
-    finally:
-        if process is not None:
-            process.kill()
-            process.wait()
-
-
-def compile_requested() -> None:
-    """In the second process: compile the tasks listed on standard input, the last one first."""
-    for module, name, arguments_type in reversed(pickle.load(sys.stdin.buffer)):
-        getattr(importlib.import_module(module), name).address(arguments_type)
+    return call_blocks
