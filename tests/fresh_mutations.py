@@ -131,14 +131,14 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F19", "degrees of freedom: three less, though a field changes one component of the total momentum",
-        "dynamics/momenta.py",
+        "dynamics/model.py",
         "    free = 3 * int(mobile(model).sum()) - int(model.keeps_momentum.sum())",
         "    free = 3 * int(mobile(model).sum()) - 3 * int(model.keeps_momentum.any())",
         ("test_wiring.py::test_a_field_along_one_axis_leaves_the_momentum_of_the_others",),
     ),
     Mutation(
         "F20", "start: angular momenta about axes in proportion to their moments, not to the root",
-        "dynamics/momenta.py",
+        "dynamics/model.py",
         "        spread = np.sqrt(thermal * model.inertia[model.species])",
         "        spread = thermal * model.inertia[model.species]",
         ("test_wiring.py::test_a_start_has_a_thermal_energy_about_each_axis",),

@@ -43,8 +43,8 @@ CORE = [
     Mutation(
         "A4", "molecular virial: the transpose of its tensor",
         "forces/neighbors/sites.py",
-        "                    virial[3 * row + k] += force[row] * offset[k]",
-        "                    virial[3 * row + k] += force[k] * offset[row]",
+        "                    virial[block, 3 * row + k] += force[row] * offset[k]",
+        "                    virial[block, 3 * row + k] += force[k] * offset[row]",
         ("test_forces.py::test_virials_are_sums_over_pairs[triclinic-double]",),
     ),
     Mutation(
@@ -63,9 +63,9 @@ CORE = [
     ),
     Mutation(
         "A7", "a frame that spins up: its rate at the start of a step, not in the middle",
-        "forces/body/frame.py",
-        "        middle = time + 0.5 * h",
-        "        middle = time",
+        "mechanics/translation.py",
+        "frame_rate(frame, time + 0.5 * h)",
+        "frame_rate(frame, time)",
         ("test_body_engine.py::test_a_changing_or_accelerating_frame_agrees_with_one_that_does_not_turn",),
     ),
     Mutation(
@@ -211,7 +211,7 @@ RINGS = [
     ),
     Mutation(
         "B14", "start: the total momentum of a mixture is removed with equal weights",
-        "dynamics/momenta.py",
+        "dynamics/model.py",
         "    velocity -= momentum / mass.sum()",
         "    velocity -= np.where(model.keeps_momentum, velocity.mean(axis=0), 0.0)",
         (

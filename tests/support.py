@@ -265,7 +265,7 @@ HOMES = {
     "analysis.result": "Curve AnalysisResult Value converged_value",
     "analysis.rigid_frames": "_without_rounding fit_frames frames_of_folder steady_from",
     "io.formats.bonds": "bonds connections",
-    "dynamics.model": "Model",
+    "dynamics.model": "Model draw_momenta mobile remove_momentum",
     "run.pilot.trial_systems": "COMPARATORS _fit_step body_trial_system molecular_trial_system",
     "run.rigid_fit": "kinds_of",
     "figures.run": "energy_figure",
@@ -280,7 +280,6 @@ HOMES = {
     "assemble.describe": "MIXED_ERROR describe",
     "io.formats": "BY_EXTENSION",
     "io.formats.gsd": "GsdFile GsdReader",
-    "dynamics.momenta": "draw_momenta mobile remove_momentum",
     "assemble.memory_check": "array_bytes",
     "assemble.stage_flows": "barostat_of integrator_of_stage thermostat_of",
     "assemble.structure": "read_structure",
@@ -309,7 +308,8 @@ HOMES = {
     "forces.body.applied": "SteadyForce",
     "forces.potentials.coulomb": "radial reaction_field",
     "forces.potentials.truncation": "SWITCH_FUNCTIONS SwitchCorrection SwitchTerm TRUNCATIONS Unmodified truncation_terms",
-    "forces.potentials.formulas": "FormulaError formula_of_function formula_of_table formula_of_text",
+    "forces.potentials.formulas": "FormulaError formula_of_function formula_of_table",
+    "forces.potentials.text_formulas": "formula_of_text",
     "forces.potentials.lennard_jones": "lennard_jones",
     "forces.potentials.custom": "CustomOneKind tail_of_pair",
     "forces.potentials.screened_coulomb": "INTERVALS TABLE_ERROR TabledScreening force_table screened screening screening_of_lanes",
@@ -323,8 +323,7 @@ HOMES = {
     "forces.neighbors.space": "Triclinic cell_of",
     "forces.terms": "TermDispatcher",
     "forces.ewald.corrections": "intramolecular_energy",
-    "forces.ewald.direct_sum": "ewald_sum_in_numpy",
-    "forces.ewald.k_vectors": "k_vectors_up_to",
+    "forces.ewald.direct_sum": "ewald_sum_in_numpy k_vectors_up_to",
     "view.mesh": "UNITS mesh_of",
     "view.plots": "columns_figure draw_panel panels record_of",
     "view.run_page": "write_report",
@@ -341,7 +340,9 @@ HOMES = {
     "run.pilot.trials": "Method IntegratorAccuracy TrialSystem Trial measure time_span",
     "mechanics.translation": "NoTranslation",
     "mechanics.batches": "LANES kick_group apply_langevin_group rotate_group",
-    "mechanics.inertia": "inertia_tensor kind_of_body principal_frame",
+    "mechanics.inertia": (
+        "COMPONENTS_PER_DIMENSION SOLIDS added_mass_of_ellipsoid inertia_tensor kind_of_body principal_frame solid "
+    ),
     "mechanics.rotation": (
         "align angular_velocity_of_euler_rates attitude_matrix euler_rates from_attitude_matrix "
         "from_euler_angles from_quaternion from_vector from_yaw_pitch_roll hat nearest_rotation "
@@ -352,7 +353,6 @@ HOMES = {
         "constant_function integrate_function interpolated_function is_constant_function "
         "pulse_function sum_functions values_at"
     ),
-    "mechanics.solids": "COMPONENTS_PER_DIMENSION SOLIDS added_mass_of_ellipsoid solid",
     "scene.models": (
         "GROUPS MODELS Molecule Site available_models load_model molecule read_molecule read_parameters with_masses"
     ),
@@ -430,7 +430,7 @@ MODULES = {
     "integrator_rows": "scene.integrators",
     "film": "view.animation",
     "formats": "io.formats",
-    "formulas": "forces.potentials.formulas",
+    "formulas": "forces.potentials.text_formulas",
     "gromacs_files": "engines.gromacs.files",
     "groups": "mechanics.batches",
     "lammps": "engines.lammps.engine",
@@ -458,7 +458,7 @@ MODULES = {
     "sweeping": "studies.sweep.sweeping",
     "reading_process": "io.formats.through_mdanalysis",
     "watch": "run.checks",
-    "wave_vectors": "forces.ewald.k_vectors",
+    "wave_vectors": "forces.ewald.direct_sum",
     "worker": "studies.sweep.worker",
 }
 

@@ -38,7 +38,7 @@ LIBRARIES = {
     "openmm": {"engines/openmm"},
     "pydantic": {"scene", "io", "run", "analysis/files.py", "studies/sweep"},
     "rocket_fft": {"forces/ewald/pme.py"},
-    "sympy": {"forces/potentials/formulas.py", "engines/force_field.py"},
+    "sympy": {"forces/potentials/text_formulas.py", "engines/force_field.py"},
     "tomli_w": {"io/scene_file.py"},
 }  # fmt: skip
 

@@ -32,7 +32,7 @@ def every_operation(a, b, out, sums):
     width = simd.lanes_of(a)
     x, y = simd.load(a, 0), simd.load(b, 0)
     results = (
-        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, simd.maximum(x, y), simd.minimum(x, 1.5), simd.inverse_square_root(x),
+        x + y, x - y, x * y, x / y, 2.0 - x, x * 3, max(x, y), min(x, 1.5), simd.inverse_square_root(x),
         simd.select(x < y, x, 0.0), simd.select(simd.mask_from_bits(5, x), y, x), cube(x),
     )  # fmt: skip
     for k in range(12):
@@ -198,8 +198,9 @@ def test_the_pair_loops_of_water_are_vectorised(precision):
     engine.evaluate(state)
     kind = {"double": "double", "mixed": "float"}[precision]
     for own in engine.workspaces.values():
-        task_arguments = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums)))
-        fresh = numba.cfunc(types.void(task_arguments, types.intp), **pairs._forces.options)(pairs._forces.function)
+        task_arguments = TaskArguments(numba.typeof((own.slot_potential, own.pairs, own.sums, None, None)))
+        task = pairs._sum_forces
+        fresh = numba.cfunc(types.void(task_arguments, types.intp), **task.options)(task.function)
         vector = f"<{SIMD_BITS // (64 if kind == 'double' else 32)} x {kind}>"
         code = fresh.inspect_llvm()
         assert "NRT" not in code  # nothing in it counts references

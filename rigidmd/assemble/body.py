@@ -14,18 +14,16 @@ from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce
-from rigidmd.forces.body.frame import InertialFrame, RotatingFrame
 from rigidmd.forces.body.resistance import NoResistance, Resistance
 from rigidmd.io.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
-from rigidmd.mechanics.inertia import inertia_tensor, shifted_inertia
+from rigidmd.mechanics.inertia import added_mass_of_ellipsoid, inertia_tensor, shifted_inertia, solid
 from rigidmd.mechanics.rotation import unit_vector
-from rigidmd.mechanics.solids import added_mass_of_ellipsoid, solid
 from rigidmd.mechanics.time_functions import (
     TimeFunction, constant_function, has_constant_direction, integrate_function, interpolated_function,
     is_constant_function, pulse_function, sum_functions, values_at,
 )  # fmt: skip
-from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, NoTranslation
+from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import axis_of_symmetry
 from rigidmd.scene.body_forces import Fluid, Friction, Timed

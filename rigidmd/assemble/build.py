@@ -12,8 +12,7 @@ from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
 from rigidmd.core.state import state_of
-from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.momenta import conserved_momentum, count_degrees_of_freedom, mobile
+from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from rigidmd.core.integrators import Scheme
 from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
-from rigidmd.dynamics.momenta import mobile
+from rigidmd.dynamics.model import mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
 from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp, VelocityRescaling, constant_ramp
 from rigidmd.engines.system import System

@@ -10,8 +10,7 @@ import numpy as np
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.assemble.structure import Configuration, read_structure, with_reduced_cell
 from rigidmd.core.state import State
-from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.momenta import draw_momenta, mobile, remove_momentum
+from rigidmd.dynamics.model import Model, draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.fields.walls import range_of_centres

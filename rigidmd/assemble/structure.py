@@ -12,7 +12,7 @@ from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
 from rigidmd.errors import StructureError
-from rigidmd.forces.ewald.k_vectors import SAME_BASIS
+from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.io.formats.atoms import SAME_MASS, Atoms
 from rigidmd.io.formats.cells import (
     basis_of, cell_error, describe_basis, describe_cell, least_skewed_cell, reduced_cell, right_angled, same_lattice,

@@ -4,16 +4,11 @@ The names that the author of a term needs are exported here; `simd` has the vect
 """
 
 # isort: skip_file
-from rigidmd.compile import settings  # noqa: F401  (before Numba is loaded)
+# ruff: noqa: F401  (other packages import these names from here)
+from rigidmd.compile import settings  # before Numba is loaded
 from rigidmd.compile.code import (
     BoundTask, Code, CompiledTask, NumbaStruct, TaskArguments, call, call_blocks, load_arguments, pack_arguments, task,
 )  # fmt: skip
 from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
 from rigidmd.compile.thread_pool import call_address, set_threads
-
-__all__ = [
-    "BLOCKS", "MOST_BLOCKS", "SIMD_BITS", "BoundTask", "Code", "CompiledTask", "NumbaStruct", "TaskArguments",
-    "call", "call_address", "call_blocks", "chosen_by_type", "implements", "is_a", "kernel", "load_arguments",
-    "pack_arguments", "set_threads", "task",
-]  # fmt: skip

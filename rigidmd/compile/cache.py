@@ -122,8 +122,14 @@ class CacheIndex(IndexDataCacheFile):
 
     def load(self, key):
         """A compiled function; None if it is not stored."""
-        index = self._index_for(key)
-        return None if index is None else index._load(key)
+        index, shared = self._index_for(key), shared_folder()
+        found = None if index is None else super(CacheIndex, index).load(key)
+        if found is None and index is not None and shared is not None:
+            there = copy.copy(index)
+            there._cache_path = index._cache_path.replace(cache_folder(), shared, 1)
+            there._index_path = index._index_path.replace(cache_folder(), shared, 1)
+            found = super(CacheIndex, there).load(key)
+        return found
 
     def save(self, key, data):
         """Store a compiled function."""
@@ -142,16 +148,6 @@ class CacheIndex(IndexDataCacheFile):
         digest = hashlib.sha256(" ".join(modules).encode()).hexdigest()[:16]
         index._index_path = f"{self._index_path}.{digest}"
         return index
-
-    def _load(self, key):
-        found = super().load(key)
-        shared = shared_folder()
-        if found is None and shared is not None:
-            index = copy.copy(self)
-            index._cache_path = self._cache_path.replace(cache_folder(), shared, 1)
-            index._index_path = self._index_path.replace(cache_folder(), shared, 1)
-            found = super(CacheIndex, index).load(key)
-        return found
 
     def _data_name(self, number):
         return f"{super()._data_name(number)}.{secrets.token_hex(8)}"

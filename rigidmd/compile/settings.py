@@ -10,33 +10,26 @@ NUMBA_THREAD_LIMIT = 4096
 #: Bytes of address space to load LLVM and SciPy. With less they fail, and OpenBLAS may hang.
 LIBRARY_BYTES = 4e8
 
-
-def _check_settings() -> None:
-    """Raise SettingError for settings with which libraries would hang, compile nothing, or print a traceback."""
-    if (left := address_space_left()) < LIBRARY_BYTES:
+# With these settings libraries would hang, compile nothing, or print a traceback.
+if (left := address_space_left()) < LIBRARY_BYTES:
+    raise SettingError(
+        f"not enough memory: libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and the limit of this "
+        f"process leaves {format_gigabytes(left)}; raise it (ulimit -v)"
+    )
+threads = os.environ.get("NUMBA_NUM_THREADS")
+if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= NUMBA_THREAD_LIMIT):
+    raise SettingError(f"NUMBA_NUM_THREADS is {threads[:40]!r}, must be a whole number from 1 to {NUMBA_THREAD_LIMIT}")
+with warnings.catch_warnings():
+    warnings.filterwarnings("error", "Environment variable 'NUMBA_", RuntimeWarning)
+    try:
+        import numba
+    except RuntimeWarning as warning:  # names the variable between its first two quotes
+        name = str(warning).split("'")[1]
         raise SettingError(
-            f"not enough memory: libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and the limit of this "
-            f"process leaves {format_gigabytes(left)}; raise it (ulimit -v)"
-        )
-    threads = os.environ.get("NUMBA_NUM_THREADS")
-    if threads and not (threads.isascii() and threads.isdigit() and 0 < int(threads[:9]) <= NUMBA_THREAD_LIMIT):
-        raise SettingError(
-            f"NUMBA_NUM_THREADS is {threads[:40]!r}, must be a whole number from 1 to {NUMBA_THREAD_LIMIT}"
-        )
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", "Environment variable 'NUMBA_", RuntimeWarning)
-        try:
-            import numba
-        except RuntimeWarning as warning:  # names the variable between its first two quotes
-            name = str(warning).split("'")[1]
-            raise SettingError(
-                f"{name} is {os.environ[name][:40]!r}, which Numba cannot read: unset it, or give it a value that "
-                "Numba's manual names"
-            ) from None
-    if numba.config.DISABLE_JIT:  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
-        raise SettingError(
-            "NUMBA_DISABLE_JIT is set: Numba would compile nothing, and the kernels run only as compiled code. Unset it"
-        )
-
-
-_check_settings()
+            f"{name} is {os.environ[name][:40]!r}, which Numba cannot read: unset it, or give it a value that "
+            "Numba's manual names"
+        ) from None
+if numba.config.DISABLE_JIT:  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
+    raise SettingError(
+        "NUMBA_DISABLE_JIT is set: Numba would compile nothing, and the kernels run only as compiled code. Unset it"
+    )

@@ -1,9 +1,10 @@
 """SIMD vectors for compiled code: a Numba type whose values are LLVM vectors.
 
-Lanes of float32 or float64 support `+ - * /`, mix with scalars (which fill all lanes), compare to masks, and are loaded
-from and stored to contiguous arrays. The number of lanes follows from the machine (machine.SIMD_BITS): 16 float32 with
-AVX-512, 8 with AVX2, otherwise 4; half as many float64. `simd_types` has the types and operators, `simd_memory` loads
-and stores, `simd_math` functions of mathematics, and this file, from which kernels import all, the other functions.
+Lanes of float32 or float64 support `+ - * /`, `max` and `min` (of x and y: y where x is NaN), mix with scalars (which
+fill all lanes), compare to masks, and are loaded from and stored to contiguous arrays. The number of lanes follows from
+the machine (machine.SIMD_BITS): 16 float32 with AVX-512, 8 with AVX2, otherwise 4; half as many float64. `simd_types`
+has the types and operators, `simd_memory` loads and stores, `simd_math` functions of mathematics, and this file, from
+which kernels import all, the other functions.
 
 Functions that appear in formulas also accept scalars, so that one formula serves pair loops and single numbers.
 """
@@ -14,7 +15,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rigidmd.compile.kernels import chosen_by_type, kernel
+from rigidmd.compile.kernels import chosen_by_type
 from rigidmd.compile.simd_math import HAS_AVX512, inverse, inverse_root_and_cube, inverse_square_root, square_root
 from rigidmd.compile.simd_memory import (
     align_stack, broadcast, emit_load, emit_store, is_contiguous, lane_count, load, load_broadcast, load_eight,
@@ -35,18 +36,6 @@ def pairwise_minimum(typing, x):
         return builder.select(builder.fcmp_ordered("<", value, neighbor), value, neighbor)
 
     return emitted(x(x), emit)
-
-
-@kernel(inline=True)
-def maximum(x, y):
-    """The larger of x and y in each lane, y if x is NaN; y may be a scalar."""
-    return max(x, y)
-
-
-@kernel(inline=True)
-def minimum(x, y):
-    """The smaller of x and y in each lane, y if x is NaN; y may be a scalar."""
-    return min(x, y)
 
 
 @intrinsic

@@ -181,12 +181,8 @@ _define_operators([operator.mul, operator.imul], ir.IRBuilder.fmul)
 _define_operators([operator.truediv, operator.itruediv], ir.IRBuilder.fdiv)
 
 
-def _choose(sign, builder, a, b):
-    return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
-
-
-for _function, _sign in ((max, ">"), (min, "<")):
-    _define_operators([_function], partial(_choose, _sign))
+_define_operators([max], lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+_define_operators([min], lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
 def _compare(sign, builder, a, b):

@@ -258,7 +258,8 @@ class _ThreadPool:
         self._starting = threading.RLock()
 
     def start(self) -> None:
-        """Compile the loops of the pool, or read them from the cache, and start the missing workers."""
+        """Compile the loops of the pool, or read them from the cache. Start the missing workers, and use as many as are
+        wanted."""
         with self._starting:
             if not self.code:
                 options = compiler_options(count_references=False)
@@ -268,14 +269,9 @@ class _ThreadPool:
                 ]
                 self.cells[RUN_TASK] = self.code[0].address
                 self.cells[CALLER_LOCK] = _new_lock()
-                self.cells[POLLS] = self._polls()
-            self.start_missing()
-
-    def start_missing(self) -> None:
-        """Start the workers that are missing, and use as many as are wanted. Does nothing before `start`."""
-        if not self.code:
-            return
-        with self._starting:
+                poll, count = self._c_function(2), 500
+                fastest = min(timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3))
+                self.cells[POLLS] = max(1, int(count * POLLING_TIME / fastest))
             workers = self.wanted - 1
             for index in range(self.started, workers):
                 line = FIRST_WORKER + LINE * index
@@ -290,12 +286,6 @@ class _ThreadPool:
     def _c_function(self, which: int):
         """A function of two integers that runs without Python's lock."""
         return ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)(self.code[which].address)
-
-    def _polls(self) -> int:
-        """Number of polls in `POLLING_TIME`."""
-        poll, count = self._c_function(2), 500
-        fastest = min(timeit.repeat(lambda: poll(self.cells.ctypes.data, count), number=1, repeat=3))
-        return max(1, int(count * POLLING_TIME / fastest))
 
     def reset_after_fork(self) -> None:
         """A child process has no workers."""
@@ -328,5 +318,5 @@ start_workers = _pool.start
 def set_threads(count: int) -> None:
     """Number of threads that compute, the calling thread included; results do not depend on it."""
     _pool.wanted = count
-    if count - 1 != _pool.cells[WORKERS]:  # also true after a fork
-        _pool.start_missing()
+    if _pool.code and count - 1 != _pool.cells[WORKERS]:  # not before the first task; also after a fork
+        _pool.start()

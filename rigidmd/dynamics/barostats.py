@@ -13,14 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.integrators import BAROSTAT
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
-from rigidmd.dynamics.force_gradient import copy
 from rigidmd.dynamics.noise import Key, normals, uniforms
 from rigidmd.dynamics.thermostats import Ramp, ramp_value, scale_array, translational_energy
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, compute_load
+from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, compute_load, copy
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -111,26 +110,23 @@ class Confinement(NamedTuple):
     key: Key
 
 
-def _cell_rescaling(stage, given: Confinement) -> CellRescaling:
-    rate, coordinate = given.compressibility / stage.barostat_time, COUPLINGS[stage.pressure_coupling]
-    return CellRescaling(given.thermal_energy, given.pressure, rate, coordinate, given.at_rest, given.tail, given.key)
-
-
-def _volume_moves(stage, given: Confinement) -> VolumeMoves:
-    thermal = given.thermal_energy
-    width = WIDTH * np.sqrt(max(thermal.first, thermal.last) * given.compressibility * given.volume)
-    return VolumeMoves(thermal, given.pressure, float(width), given.molecules, given.tail, given.key)
-
-
-def _piston(stage, given: Confinement) -> Piston:
-    """With it, the volume oscillates with the period barostat_time_ps: the spring is dP/dV = -1/(compressibility V), so
-    M = (period/2 pi)²/(compressibility V)."""
-    inverse_mass = given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2
-    return Piston(given.pressure, inverse_mass, given.tail)
-
-
-#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage.
-BAROSTATS = {"cell_rescaling": _cell_rescaling, "monte_carlo": _volume_moves, "piston": _piston}
+#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a `Confinement`. With the
+#: piston the volume oscillates with the period barostat_time_ps: the spring is dP/dV = -1/(compressibility V), so M =
+#: (period/2 pi)²/(compressibility V).
+BAROSTATS = {
+    "cell_rescaling": lambda stage, given: CellRescaling(
+        given.thermal_energy, given.pressure, given.compressibility / stage.barostat_time,
+        COUPLINGS[stage.pressure_coupling], given.at_rest, given.tail, given.key
+    ),
+    "monte_carlo": lambda stage, given: VolumeMoves(
+        given.thermal_energy, given.pressure,
+        WIDTH * sqrt(max(given.thermal_energy[:2]) * given.compressibility * given.volume), given.molecules, given.tail,
+        given.key
+    ),
+    "piston": lambda stage, given: Piston(
+        given.pressure, given.compressibility * given.volume * (2 * np.pi / stage.barostat_time) ** 2, given.tail
+    ),
+}  # fmt: skip
 
 
 class BarostatWorkspace(NamedTuple):
@@ -154,27 +150,13 @@ def barostat_workspace(state: State) -> BarostatWorkspace:
     )  # fmt: skip
 
 
+@chosen_by_type(inline=True)
 def compute_step_load(barostat, terms, state, load, workspace, flows, which):
     """Forces and torques at the present positions; a status code.
 
     which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always computes virials, and
         energies if the move depends on them
     """
-    raise TypeError("compiled code only")
-
-
-def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """The flow of a barostat over a time h, in place; a status code. progress : see `advance`."""
-    raise TypeError("compiled code only")
-
-
-def scale_box(barostat, state, h):
-    """The flow of the volume by the inertia of a piston, in place."""
-    raise TypeError("compiled code only")
-
-
-@implements(compute_step_load, inline=True)
-def _compute_step_load(barostat, terms, state, load, workspace, flows, which):
     if is_a(barostat, NoBarostat):
         return lambda barostat, terms, state, load, workspace, flows, which: compute_load(terms, state, load, which)
 
@@ -204,22 +186,32 @@ def compute_load_and_virial(terms, state, load, workspace, which):
     return status
 
 
-@implements(scale_box)
-def _scale_box(barostat, state, h):
-    return _move_piston if is_a(barostat, Piston) else lambda barostat, state, h: None
+@chosen_by_type
+def scale_box(barostat, state, h):
+    """The flow of the volume by the inertia of a piston, in place."""
+    if not is_a(barostat, Piston):
+        return lambda barostat, state, h: None
+
+    def move_piston(barostat, state, h):
+        volume = volume_of(state.cell)
+        after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
+        scale = (after / volume) ** (1 / 3)
+        scale_array(state.position, scale)
+        scale_array(state.velocity, 1 / scale)
+        scale_array(state.cell, scale)
+        state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
+
+    return move_piston
 
 
-def _move_piston(barostat, state, h):
-    volume = volume_of(state.cell)
-    after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
-    scale = (after / volume) ** (1 / 3)
-    scale_array(state.position, scale)
-    scale_array(state.velocity, 1 / scale)
-    scale_array(state.cell, scale)
-    state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
+@chosen_by_type
+def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
+    """The flow of a barostat over a time h, in place; a status code. progress : see `advance`."""
+    if is_a(barostat, NoBarostat):
+        return lambda barostat, model, terms, state, load, workspace, progress, h, draw: OK
+    return _kick_piston if is_a(barostat, Piston) else _try_move
 
 
-@implements(apply_barostat, Piston)
 def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
     if progress[1] != 1 or workspace.known[0] == 0:
         status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
@@ -235,28 +227,6 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
     return OK
 
 
-def propose_strain(barostat, model, state, workspace, h, draw):
-    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
-    raise TypeError("compiled code only")
-
-
-def rescale_velocities(barostat, state, workspace):
-    """Change the velocities with the strain, unless the barostat keeps them."""
-    raise TypeError("compiled code only")
-
-
-def log_acceptance(barostat, model, state, workspace, h):
-    """The logarithm of the acceptance probability of a move that has been made."""
-    raise TypeError("compiled code only")
-
-
-@implements(apply_barostat)
-def _apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if is_a(barostat, NoBarostat):
-        return lambda barostat, model, terms, state, load, workspace, progress, h, draw: OK
-    return None if is_a(barostat, Piston) else _try_move
-
-
 def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
     if progress[2] == 0:
         if progress[1] != 1 or workspace.known[0] == 0:
@@ -266,7 +236,7 @@ def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw)
                 return status
             progress[1] = 1
         propose_strain(barostat, model, state, workspace, h, draw)
-        save_before_move(state, load, workspace)
+        copy_moved(state, load, workspace, workspace.load, workspace.tally[0], workspace.tally[1])
         apply_strain(barostat, state, workspace)
         progress[2] = 1
     status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
@@ -280,7 +250,7 @@ def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw)
         workspace.counts[1] += 1
         state.energy_ledger[WORK] += energy_gained(barostat, model, state, workspace)
     else:
-        undo_move(state, load, workspace)
+        copy_moved(workspace, workspace.load, state, load, workspace.tally[1], workspace.tally[0])
         terms.tallies_valid[0] = 0
     return OK
 
@@ -292,6 +262,11 @@ def target_pressure(pressure, state, k):
     return pressure.first[k] + (pressure.last[k] - pressure.first[k]) * fraction
 
 
+def propose_strain(barostat, model, state, workspace, h, draw):
+    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
+    raise TypeError("compiled code only")
+
+
 @implements(propose_strain, VolumeMoves)
 def propose_volume(barostat, model, state, workspace, h, draw):
     u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
@@ -300,19 +275,6 @@ def propose_volume(barostat, model, state, workspace, h, draw):
     for k in range(3):
         workspace.strain[0, k] = log(max(1 + (2 * u - 1) * barostat.width / volume, 0.1)) / 3
     set_matrices(workspace)
-
-
-@implements(rescale_velocities, VolumeMoves)
-def keep_velocities(barostat, state, workspace):
-    return None
-
-
-@implements(log_acceptance, VolumeMoves)
-def log_acceptance_of_volume(barostat, model, state, workspace, h):
-    before, after = volume_of(workspace.cell), volume_of(state.cell)
-    work = target_pressure(barostat.pressure, state, 0) * (after - before)
-    work = energy_gained(barostat, model, state, workspace) + work
-    return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
 
 
 @implements(propose_strain, CellRescaling)
@@ -357,14 +319,34 @@ def strain_force(barostat, model, state, workspace, k, volume, thermal):
     return total
 
 
-@implements(rescale_velocities, CellRescaling)
-def divide_velocities(barostat, state, workspace):
-    inverse = workspace.matrices[1]
-    for m in range(len(state.velocity)):
-        x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
-        state.velocity[m, 0] = inverse[0, 0] * x
-        state.velocity[m, 1] = inverse[1, 0] * x + inverse[1, 1] * y
-        state.velocity[m, 2] = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
+@chosen_by_type
+def rescale_velocities(barostat, state, workspace):
+    """Change the velocities with the strain, unless the barostat keeps them."""
+    if not is_a(barostat, CellRescaling):
+        return lambda barostat, state, workspace: None
+
+    def divide_velocities(barostat, state, workspace):
+        inverse = workspace.matrices[1]
+        for m in range(len(state.velocity)):
+            x, y, z = state.velocity[m, 0], state.velocity[m, 1], state.velocity[m, 2]
+            state.velocity[m, 0] = inverse[0, 0] * x
+            state.velocity[m, 1] = inverse[1, 0] * x + inverse[1, 1] * y
+            state.velocity[m, 2] = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
+
+    return divide_velocities
+
+
+def log_acceptance(barostat, model, state, workspace, h):
+    """The logarithm of the acceptance probability of a move that has been made."""
+    raise TypeError("compiled code only")
+
+
+@implements(log_acceptance, VolumeMoves)
+def log_acceptance_of_volume(barostat, model, state, workspace, h):
+    before, after = volume_of(workspace.cell), volume_of(state.cell)
+    work = target_pressure(barostat.pressure, state, 0) * (after - before)
+    work = energy_gained(barostat, model, state, workspace) + work
+    return barostat.molecules * log(after / before) - work / ramp_value(barostat.thermal_energy, state)
 
 
 @implements(log_acceptance, CellRescaling)
@@ -373,11 +355,9 @@ def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
     matrix, inverse = workspace.matrices[0], workspace.matrices[1]
     there, back = workspace.strain, np.zeros((2, 6))
     drift(barostat, model, state, workspace, h, back[0], back[1])
-    mean = (
-        target_pressure(barostat.pressure, state, 0)
-        + target_pressure(barostat.pressure, state, 1)
-        + target_pressure(barostat.pressure, state, 2)
-    ) / 3
+    target = barostat.pressure
+    x, y, z = target_pressure(target, state, 0), target_pressure(target, state, 1), target_pressure(target, state, 2)
+    mean = (x + y + z) / 3
     work = energy_gained(barostat, model, state, workspace) + mean * (after - before)
     chance = log(after / before)
     used = -1
@@ -402,23 +382,14 @@ def log_acceptance_of_rescaling(barostat, model, state, workspace, h):
 
 
 @kernel
-def save_before_move(state, load, workspace):
-    copy(state.position, workspace.position)
-    copy(state.velocity, workspace.velocity)
-    copy(load.force, workspace.load.force)
-    copy(load.torque_body, workspace.load.torque_body)
-    copy(workspace.tally[:1], workspace.tally[1:])
-    copy(state.cell, workspace.cell)
-
-
-@kernel
-def undo_move(state, load, workspace):
-    copy(workspace.position, state.position)
-    copy(workspace.velocity, state.velocity)
-    copy(workspace.load.force, load.force)
-    copy(workspace.load.torque_body, load.torque_body)
-    copy(workspace.tally[1:], workspace.tally[:1])
-    copy(workspace.cell, state.cell)
+def copy_moved(source, load, target, load_there, tally, tally_there):
+    """Copy what a move changes, from `source` to `target`: a state and a workspace, each with a load and a tally."""
+    copy(source.position, target.position)
+    copy(source.velocity, target.velocity)
+    copy(source.cell, target.cell)
+    copy(load.force, load_there.force)
+    copy(load.torque_body, load_there.torque_body)
+    copy(tally, tally_there)
 
 
 @kernel

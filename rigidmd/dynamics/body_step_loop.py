@@ -7,12 +7,12 @@ from rigidmd.compile import implements, is_a, kernel
 from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics.force_gradient import add_gyration, displace
 from rigidmd.dynamics.step_loop import accumulate_work, drift, kick
-from rigidmd.forces.body.frame import InertialFrame, RotatingFrame, frame_rate, rotate_with_frame
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
 from rigidmd.forces.terms import total_power
 from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, rotate_by_vector
 from rigidmd.mechanics.translation import (
-    FluidTranslation, FreeTranslation, NoTranslation, body_component, inertial_mass, translate,
+    FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame, body_component, body_vector,
+    frame_rate, inertial_mass, lab_vector, rotate_with_frame, translate,
 )  # fmt: skip
 
 
@@ -44,12 +44,8 @@ def _displace_body(model, state, load, tau):
         for i in range(3):
             state.position[k, i] += tau / model.translation.mass * load.force[k, i]
     for k in range(len(load.torque_body)):
-        n, time = load.torque_body[k], state.time[NOW]
-        i0, i1, i2 = (
-            moments(model.rotor, time, 0)[0],
-            moments(model.rotor, time, 1)[0],
-            moments(model.rotor, time, 2)[0],
-        )
+        n, t = load.torque_body[k], state.time[NOW]
+        i0, i1, i2 = moments(model.rotor, t, 0)[0], moments(model.rotor, t, 1)[0], moments(model.rotor, t, 2)[0]
         rotate_by_vector(state.rotation[k], tau * i0 * n[0], tau * i1 * n[1], tau * i2 * n[2])
 
 
@@ -90,26 +86,16 @@ def relative_motion(model, state):
             a = body_component(q, V, 0) * model.translation.mass / inertial_mass(model.translation, 0)
             b = body_component(q, V, 1) * model.translation.mass / inertial_mass(model.translation, 1)
             c = body_component(q, V, 2) * model.translation.mass / inertial_mass(model.translation, 2)
-            velocity = (
-                q[0, 0] * a + q[0, 1] * b + q[0, 2] * c,
-                q[1, 0] * a + q[1, 1] * b + q[1, 2] * c,
-                q[2, 0] * a + q[2, 1] * b + q[2, 2] * c,
-            )
+            velocity = lab_vector(q, a, b, c)
         x = state.position[0]
-        velocity = (
-            velocity[0] - W[1] * x[2] + W[2] * x[1],
-            velocity[1] - W[2] * x[0] + W[0] * x[2],
-            velocity[2] - W[0] * x[1] + W[1] * x[0],
-        )
+        u, v, w = velocity
+        velocity = u - W[1] * x[2] + W[2] * x[1], v - W[2] * x[0] + W[0] * x[2], w - W[0] * x[1] + W[1] * x[0]
     if len(state.rotation):
         q = state.rotation[0]
         L = state.angular_momentum_body[0]
         i0, h0 = moments(model.rotor, state.time[NOW], 0)
         i1, h1 = moments(model.rotor, state.time[NOW], 1)
         i2, h2 = moments(model.rotor, state.time[NOW], 2)
-        omega = (
-            (L[0] - h0) * i0 - body_component(q, W, 0),
-            (L[1] - h1) * i1 - body_component(q, W, 1),
-            (L[2] - h2) * i2 - body_component(q, W, 2),
-        )
+        drag = body_vector(q, W)
+        omega = ((L[0] - h0) * i0 - drag[0], (L[1] - h1) * i1 - drag[1], (L[2] - h2) * i2 - drag[2])
     return velocity, omega

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidmd.compile import kernel
 from rigidmd.core.state import OK, Load, State, no_load
-from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load
+from rigidmd.forces.terms import FORCES_ONLY, INTO_OTHER_LOAD, compute_load, copy
 
 #: The difference is taken over this fraction of tau a. Over the whole of tau a (Wisdom, Holman & Touma 1996), the kick
 #: is not the gradient of a potential at order tau². With this fraction that error is below the error of the scheme, and
@@ -62,13 +62,6 @@ def evaluate(model, state, load, terms, displaced, tau, known):
             extrapolate(load.force, displaced.load.force)
             extrapolate(load.torque_body, displaced.load.torque_body)
     return status
-
-
-@kernel
-def copy(source, target):
-    """target[:] = source, as a loop, which compiles ten times faster."""
-    for n, value in enumerate(source.flat):
-        target.flat[n] = value
 
 
 @kernel

@@ -1,10 +1,13 @@
 """The compiled loop over steps, for any sequence of flows, any force terms, any thermostat and any barostat."""
 
+# isort: skip_file
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BoundTask, Code, call_blocks, implements, is_a, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import (
+    BoundTask, Code, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments, pack_arguments, task,
+)  # fmt: skip
 from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, SCALE_BOX, THERMOSTAT, Scheme
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
 from rigidmd.dynamics.barostats import apply_barostat, compute_step_load, scale_box
@@ -168,25 +171,16 @@ class Advance:
 
 
 @kernel(from_python=True)
-def advance_body(
-    model, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
-    barostat_workspace, dt, until, observed, progress
-):  # fmt: skip
+def advance_body(*arguments):
     """`advance` of a body, for Python."""
-    return advance(
-        model, None, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
-        barostat_workspace, dt, until, observed, progress
-    )  # fmt: skip
+    return advance(*arguments)
 
 
 @task()
 def _advance(arguments, block):
     bound, dt, integers, extent, sums = load_arguments(arguments)
-    model, code, state, load, terms, thermostat, barostat, flows, of_gradient, of_thermostat, of_barostat = bound
-    integers[STATUS] = advance(
-        model, code, state, load, terms, thermostat, barostat, flows, of_gradient, of_thermostat, of_barostat,
-        dt[0], integers[UNTIL], integers[OBSERVED] != 0, integers[PROGRESS:]
-    )  # fmt: skip
+    model, _, state, load = bound[:4]
+    integers[STATUS] = advance(*bound, dt[0], integers[UNTIL], integers[OBSERVED] != 0, integers[PROGRESS:])
     if integers[STATUS] == OK:
         find_largest(
             state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
@@ -210,26 +204,10 @@ def drift(model, code, state, load, pending, h):
     raise TypeError("compiled code only")
 
 
-def apply_pending_kicks(model, code, state, load, pending):
-    """Do the pending kicks, in place. Returns NO_PENDING_KICKS."""
-    raise TypeError("compiled code only")
-
-
-def accumulate_work(model, terms, state, h):
-    """Add the work of time-dependent terms over h to the energy ledger; half before a kick, half after it. The work on
-    a body is the power of its terms at the present velocity. The work on molecules is the rate at which their potential
-    energy changes at fixed positions."""
-    raise TypeError("compiled code only")
-
-
+@chosen_by_type
 def remove_momentum_flow(model, state):
     """Remove the conserved components of the total momentum, in place: the same velocity from all molecules. The energy
     that this removes is entered in the energy ledger."""
-    raise TypeError("compiled code only")
-
-
-@implements(remove_momentum_flow)
-def _remove_momentum_of_molecules(model, state):
     if not is_a(model, Model):
         return lambda model, state: None
 
@@ -267,8 +245,9 @@ def _drift_molecules(model, code, state, load, pending, h):
     _move_all(model, code, state, load, pending, h, True)
 
 
-@implements(apply_pending_kicks)
-def _apply_pending_kicks(model, code, state, load, pending):
+@chosen_by_type
+def apply_pending_kicks(model, code, state, load, pending):
+    """Do the pending kicks, in place. Returns NO_PENDING_KICKS."""
     if not is_a(model, Model):
         return lambda model, code, state, load, pending: pending
 
@@ -300,8 +279,11 @@ def _add_gyration_of_molecules(model, load, tau, gain):
             gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
 
 
-@implements(accumulate_work)
-def _accumulate_work_of_molecules(model, terms, state, h):
+@chosen_by_type
+def accumulate_work(model, terms, state, h):
+    """Add the work of time-dependent terms over h to the energy ledger; half before a kick, half after it. The work on
+    a body is the power of its terms at the present velocity. The work on molecules is the rate at which their potential
+    energy changes at fixed positions."""
     if not is_a(model, Model):
         return None
     if not has_time_dependent_terms(terms):
@@ -316,9 +298,8 @@ def _accumulate_work_of_molecules(model, terms, state, h):
 @kernel
 def _move_all(model, code, state, load, pending, h, drifts):
     bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
-    call_blocks(
-        code, "move", pack_arguments((*bodies, state, load, pending, h, drifts)), blocks_of(len(state.position))
-    )
+    arguments = pack_arguments((*bodies, state, load, pending, h, drifts))
+    call_blocks(code, "move", arguments, blocks_of(len(state.position)))
 
 
 @task()

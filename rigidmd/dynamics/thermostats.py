@@ -5,12 +5,15 @@
 step, from `draw` on (see `noise`).
 """
 
+# isort: skip_file
 from math import exp, expm1, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import MOST_BLOCKS, call_blocks, implements, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import (
+    MOST_BLOCKS, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments, pack_arguments, task,
+)  # fmt: skip
 from rigidmd.compile.simd import align_stack
 from rigidmd.core.state import EXAMPLE, HEAT, NOW, ORIGIN
 from rigidmd.dynamics.noise import BATCH, Key, chi_square, fill_normals, normals, uniforms
@@ -129,15 +132,12 @@ def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> dict[str, tupl
     return {}
 
 
+@chosen_by_type
 def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
     """The flow of a thermostat over a time h (ps), in place. draw : its first random draw in this step. workspace : see
     `thermostat_workspace`"""
-    raise TypeError("compiled code only")
-
-
-@implements(apply_thermostat, NoThermostat)
-def _apply_none(thermostat, model, code, state, workspace, h, draw):
-    return None
+    if is_a(thermostat, NoThermostat):
+        return lambda thermostat, model, code, state, workspace, h, draw: None
 
 
 @implements(apply_thermostat, VelocityRescaling)

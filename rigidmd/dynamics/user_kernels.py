@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from rigidmd.compile import implements, is_a
+from rigidmd.compile import implements
 from rigidmd.compile.kernels import compile_user_function
 from rigidmd.dynamics.thermostats import apply_thermostat
 from rigidmd.forces.terms import add_forces
@@ -44,12 +44,7 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
         _check_arguments(function, ("term", "state", "load", "tally"))
         compiled = compile_user_function(function)
         FORCES.add(kind)
-
-        @implements(add_forces)
-        def _add(term, state, load, tally):
-            if is_a(term, kind):
-                return lambda term, state, load, tally: compiled(term, state, load, tally)
-
+        implements(add_forces, kind)(lambda term, state, load, tally: compiled(term, state, load, tally))
         return function
 
     return register
@@ -74,12 +69,9 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
         compiled = compile_user_function(function)
         THERMOSTATS.add(kind)
 
-        @implements(apply_thermostat)
+        @implements(apply_thermostat, kind)
         def _apply(thermostat, model, code, state, workspace, h, draw):
-            if is_a(thermostat, kind):
-                return lambda thermostat, model, code, state, workspace, h, draw: compiled(
-                    thermostat, model, state, h, draw
-                )
+            return compiled(thermostat, model, state, h, draw)
 
         return function
 

@@ -9,12 +9,11 @@ from rigidmd.core.state import WORK, State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY, BODY_COLUMNS, MATRIX, Column, SampleTable
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce, steady_energies
-from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.rotation import to_euler_angles, to_quaternion, unit_vector
 from rigidmd.mechanics.time_functions import is_constant_function
-from rigidmd.mechanics.translation import FluidTranslation, inertial_masses
+from rigidmd.mechanics.translation import FluidTranslation, InertialFrame, inertial_masses
 
 
 class Snapshot(NamedTuple):

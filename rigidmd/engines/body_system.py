@@ -13,13 +13,12 @@ from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.ode.engine import OdeEngine
 from rigidmd.engines.system import Sites
 from rigidmd.errors import SimulationError
-from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.forces.body.resistance import NoResistance
 from rigidmd.forces.neighbors.space import Unbounded
 from rigidmd.mechanics.free_rotor import DrivenRotor
 from rigidmd.mechanics.inertia import BodyKind, kind_of_body
 from rigidmd.mechanics.time_functions import TimeFunction, piece_at, values_at
-from rigidmd.mechanics.translation import FluidTranslation
+from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
 from rigidmd.scene.validation import not_none

@@ -10,8 +10,7 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState
-from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.momenta import DegreesOfFreedom, mobile
+from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule

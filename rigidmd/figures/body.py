@@ -23,8 +23,8 @@ from rigidmd.figures.style import (
     settings,
     thin_series,
 )
-from rigidmd.forces.body.frame import InertialFrame
 from rigidmd.mechanics.free_rotor import SplitRotor
+from rigidmd.mechanics.translation import InertialFrame
 
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture

@@ -70,12 +70,10 @@ def add_forces(term, state, load, tally):
     raise TypeError(f"{type(term).__name__} is not a term, or this was called outside compiled code")
 
 
-@chosen_by_type(inline=True)
+@kernel(inline=True)
 def worse_status(status, other):
     """The worse of two status codes; the other may be None, which is OK."""
-    if other is types.none:
-        return lambda status, other: status
-    return lambda status, other: max(status, other)
+    return status if other is None else max(status, other)
 
 
 @chosen_by_type
@@ -124,25 +122,6 @@ class TermTable(NamedTuple):
     power: np.ndarray  # (1,) sum of the rates
 
 
-def empty_term_table(terms: int, time_dependent: bool, with_energies: np.ndarray) -> TermTable:
-    plain, tallied, rate, content = np.zeros((4, terms), np.intp)
-    known, status = np.zeros((2, 1), np.int64)
-    tallies = np.zeros((terms, TALLY_SIZE))
-    rates = rate if time_dependent else None
-    return TermTable(plain, tallied, rates, content, tallies, with_energies, known, status, np.zeros(1))
-
-
-def term_code(term: NamedTuple, table: TermTable, called: bool) -> Code:
-    """The machine code of a term for a table. called : whether the step loop calls it by address."""
-    content = (term, *EXAMPLE, EXAMPLE[1], table.tallies[0], table.status, table.power)
-    tasks = {"tallied": (_add_tallied, content)}
-    if called:
-        tasks["plain"] = (_add_plain, content)
-    if called and table.rate_address is not None:
-        tasks["rate"] = (_add_rate, content)
-    return Code(**tasks)
-
-
 @task()
 def _add_plain(arguments, block):
     term, state, load, other, _, status, _ = load_arguments(arguments)
@@ -166,38 +145,38 @@ class TermDispatcher:
     calls the terms by address. with_energies : see `Setup`"""
 
     def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool, with_energies: np.ndarray):
-        time_dependent = any(getattr(type(workspace), "time_dependent", False) for workspace in workspaces)
-        self.table = empty_term_table(len(workspaces), called and time_dependent, with_energies)
-        self._codes = [term_code(workspace, self.table, called) for workspace in workspaces]
+        tasks = {"tallied": _add_tallied} | ({"plain": _add_plain} if called else {})
+        if called and any(getattr(type(workspace), "time_dependent", False) for workspace in workspaces):
+            tasks["rate"] = _add_rate
+        plain, tallied, rate, arguments = np.zeros((4, len(workspaces)), np.intp)
+        tallies, (valid, status) = np.zeros((len(workspaces), TALLY_SIZE)), np.zeros((2, 1), np.int64)
+        rates, power = rate if "rate" in tasks else None, np.zeros(1)
+        self.table = TermTable(plain, tallied, rates, arguments, tallies, with_energies, valid, status, power)
+        self._codes: list[Code] = []
         self._structs: list[NumbaStruct] = []
-        self._given: tuple = (None,) * 4
-        self._kept: tuple = ()
-        for k, code in enumerate(self._codes):
-            self.table.tally_address[k] = code.address("tallied")
-            self.table.force_address[k] = code.address("plain") if called else 0
-            if self.table.rate_address is not None:
-                self.table.rate_address[k] = code.address("rate")
+        self._bound_to: tuple = ()
+        for k, workspace in enumerate(workspaces):
+            content = (workspace, *EXAMPLE, EXAMPLE[1], tallies[0], status, power)
+            self._codes.append(Code(**{name: (task, content) for name, task in tasks.items()}))
+            for name, addresses in (("plain", plain), ("tallied", tallied), ("rate", rate)):
+                addresses[k] = self._codes[k].address(name) if name in tasks else 0
 
     def bind(
         self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None
     ) -> TermTable:
         """The table, bound to workspaces (of the same types as the first), a state and its loads. Numba takes
         milliseconds to determine the types of the arrays, so nothing is done if these are unchanged."""
-        given = (workspaces, state, load, other)
-        if all(now is then for now, then in zip(given, self._given, strict=True)):
-            return self.table
-        kept = (*workspaces, *state, *load, *(other or load))
-        if len(kept) == len(self._kept) and all(now is then for now, then in zip(kept, self._kept, strict=True)):
-            self._given = given
-            return self.table
         table, loads = self.table, (load, other or load)
+        bound_to = (*workspaces, *state, *loads[0], *loads[1])
+        if list(map(id, bound_to)) == list(map(id, self._bound_to)):
+            return table
         self._structs = [
             code.to_struct((workspace, state, *loads, table.tallies[k], table.status, table.power))
             for k, (workspace, code) in enumerate(zip(workspaces, self._codes, strict=True))
         ]
         table.arguments_address[:] = [struct.address for struct in self._structs]
-        self._given, self._kept = given, kept
-        return self.table
+        self._bound_to = bound_to
+        return table
 
 
 @kernel(from_python=True)
@@ -218,7 +197,7 @@ def compute_load(terms, state, load, which):
     terms, which gives forces only, or a `TermTable`, which gets energies and virials. which : FORCES_ONLY,
     WITH_ENERGIES, INTO_OTHER_LOAD or WITH_VIRIALS; `load` must be the load that it means."""
     if not is_a(terms, TermTable):
-        return lambda terms, state, load, which: compute_body_load(terms, state, load, None)
+        return lambda terms, state, load, which: compute_body_load(terms, state, load)
 
     def load_by_address(terms, state, load, which):
         clear(load.force)
@@ -248,15 +227,21 @@ def clear(values):
             values[m, k] = 0.0
 
 
+@kernel
+def copy(source, target):
+    """target[:] = source, likewise."""
+    for n, value in enumerate(source.flat):
+        target.flat[n] = value
+
+
 @kernel(inline=True)
-def compute_body_load(terms, state, load, tally):
-    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code. Energies and
-    virials are added to `tally`, or not compiled if it is None."""
+def compute_body_load(terms, state, load):
+    """Write the forces and torques of all terms (a tuple) at the present positions; the worst status code."""
     load.force[:] = 0.0
     load.torque_body[:] = 0.0
     status = OK
     for term in literal_unroll(terms):
-        status = worse_status(status, add_forces(term, state, load, tally))
+        status = worse_status(status, add_forces(term, state, load, None))
     return status
 
 

@@ -76,11 +76,8 @@ def kinetic_energies(species, mass, inverse_inertia, velocity, momentum, first, 
 def _with_squares(sums, weights, values, at):
     """Three vectors of sums, with the weighted squares of the values (n, 3) of one molecule per lane added."""
     x, y, z = load(values, at), load(values, at + LANES), load(values, at + 2 * LANES)
-    return (
-        sums[0] + load(weights, 0) * x * x,
-        sums[1] + load(weights, LANES) * y * y,
-        sums[2] + load(weights, 2 * LANES) * z * z,
-    )
+    a, b, c = sums
+    return a + load(weights, 0) * x * x, b + load(weights, LANES) * y * y, c + load(weights, 2 * LANES) * z * z
 
 
 @kernel
@@ -156,11 +153,9 @@ def _friction_and_noise(before, keep, sizes, numbers, at, stride):
 @kernel(inline=True)
 def _square_gain(before, after):
     """Increase of the square of each component."""
-    return (
-        after[0] * after[0] - before[0] * before[0],
-        after[1] * after[1] - before[1] * before[1],
-        after[2] * after[2] - before[2] * before[2],
-    )
+    a, b, c = before
+    x, y, z = after
+    return x * x - a * a, y * y - b * b, z * z - c * c
 
 
 @chosen_by_type

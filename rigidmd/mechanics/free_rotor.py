@@ -126,8 +126,9 @@ def rotate(rotor, species, rotation, angular_momentum_body, m, h):
 
 @kernel(inline=True)
 def rotate_by_splitting(rotor, species, rotation, angular_momentum_body, m, h):
-    """Rotate about L, then about the axes; the two flows commute."""
-    rotate_about_momentum(rotation, angular_momentum_body, m, h * rotor.common[species])
+    """Rotate about L, which is constant, by the angle h g |L|, then about the axes; the two flows commute."""
+    L, rate = angular_momentum_body[m], h * rotor.common[species]
+    rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
     a, b, c = rotor.order[species, 0], rotor.order[species, 1], rotor.order[species, 2]
     excess = rotor.excess[species]
     rates = (excess[a], excess[b], excess[c])
@@ -289,13 +290,6 @@ def rotation_coefficient_series(x):
 
 
 @kernel(inline=True)
-def rotate_about_momentum(rotation, angular_momentum_body, m, rate):
-    """Rotate about L by the angle rate |L|: L is constant, Q <- Q R(rate L)."""
-    L = angular_momentum_body[m]
-    rotate_by_vector(rotation[m], rate * L[0], rate * L[1], rate * L[2])
-
-
-@kernel(inline=True)
 def rotate_by_vector(rotation, x, y, z):
     """Q <- Q R with the rotation vector (x, y, z) of R, body frame; its length is not needed, which saves a third."""
     odd, even = rotation_coefficients(x * x + y * y + z * z)
@@ -334,12 +328,11 @@ def driven_energy(rotor, angular_momentum_body, time):
 @chosen_by_type(inline=True)
 def moments(rotor, time, k):
     """(1/I_k, h_k) of a single body's rotor at a time; 1/I_k is 0 for an axis without inertia."""
-    if is_a(rotor, SplitRotor) or is_a(rotor, ExactRotor):
-        return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
     if is_a(rotor, DrivenRotor):
         return lambda rotor, time, k: (1 / value(rotor.inertia, time, k), value(rotor.momentum, time, k))
     if is_a(rotor, NoRotor):
         return lambda rotor, time, k: (0.0, 0.0)
+    return lambda rotor, time, k: (rotor.inverse_inertia[0, k], 0.0)
 
 
 @chosen_by_type(inline=True)

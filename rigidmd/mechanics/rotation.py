@@ -132,9 +132,8 @@ def attitude_matrix(rotation: np.ndarray) -> np.ndarray:
     return np.swapaxes(np.asarray(rotation, dtype=float), -1, -2).copy()
 
 
-def from_attitude_matrix(attitude: np.ndarray) -> np.ndarray:
-    """Q = T^T (..., 3, 3) of attitude matrices T (lab to body)."""
-    return np.swapaxes(np.asarray(attitude, dtype=float), -1, -2).copy()
+#: Q = T^T (..., 3, 3) of attitude matrices T (lab to body).
+from_attitude_matrix = attitude_matrix
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
@@ -164,10 +163,7 @@ def align(points_body: np.ndarray, points_lab: np.ndarray, weights: np.ndarray) 
     points_body (s, 3) and points_lab (n, s, 3) relative to their weighted centres; weights (s,), in practice masses.
     Linear and planar bodies are allowed. A mirror image is not matched, because the rotations are proper.
     """
-    covariance = np.einsum("s,nsi,sj->nij", weights, points_lab, points_body)
-    u, _, vt = np.linalg.svd(covariance)
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    return u @ vt
+    return nearest_rotation(np.einsum("s,nsi,sj->nij", weights, points_lab, points_body))
 
 
 def _matrix(*rows: list[np.ndarray]) -> np.ndarray:

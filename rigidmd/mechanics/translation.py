@@ -1,14 +1,21 @@
-"""The translation of a single body: free, none, or through an ideal fluid with added mass.
+"""The translation of a single body: free, none, or through an ideal fluid with added mass; frames of reference.
 
 `translate(translation, ...)` is chosen by the type at compile time, so a pinned body compiles no translation.
+
+In a non-inertial frame motion is relative to axes that rotate about an origin, which may be accelerated. Momenta are
+those relative to non-rotating axes, in components along the axes of the frame. The frame then adds one flow, a rotation
+of position, velocity and Q, from which Coriolis, centrifugal and Euler forces follow. The acceleration of the origin is
+a uniform field.
 """
 
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.mechanics.free_rotor import rotate_body
+from rigidmd.mechanics.free_rotor import rotate_body, rotate_vector, sine_and_versine
+from rigidmd.mechanics.time_functions import TimeFunction, value
 
 
 class FreeTranslation(NamedTuple):
@@ -80,6 +87,23 @@ def body_component(rotation, vector_lab, k):
     return rotation[0, k] * vector_lab[0] + rotation[1, k] * vector_lab[1] + rotation[2, k] * vector_lab[2]
 
 
+@kernel(inline=True)
+def body_vector(rotation, vector_lab):
+    """The components of a lab vector (3,) along the body axes."""
+    q, v = rotation, vector_lab
+    return body_component(q, v, 0), body_component(q, v, 1), body_component(q, v, 2)
+
+
+@kernel(inline=True)
+def lab_vector(rotation, x, y, z):
+    """The components along the lab axes of a vector with components x, y, z along the body axes."""
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
 @chosen_by_type(inline=True)
 def inertial_mass(translation, k):
     """Mass, with added mass, for motion along body axis k."""
@@ -91,3 +115,59 @@ def inertial_mass(translation, k):
 def inertial_masses(translation: FreeTranslation | NoTranslation | FluidTranslation) -> np.ndarray:
     """Mass, with added mass, along the body's axes (3,), for Python."""
     return translation.inertial_mass if isinstance(translation, FluidTranslation) else np.full(3, translation.mass)
+
+
+class InertialFrame(NamedTuple):
+    rate: float = 0.0
+
+
+class RotatingFrame(NamedTuple):
+    """Axes that rotate. The flow is exact for a constant rate, and for one about a fixed axis that is linear in time.
+    Otherwise each drift is symmetric and of order 2: compositions of symmetric steps keep their order, other schemes
+    fall to order 2."""
+
+    angular_velocity: TimeFunction  # along the axes of the frame
+
+
+@chosen_by_type(inline=True)
+def rotate_with_frame(frame, state, time, h):
+    """Rotate the state of a single body from the frame's axes at `time` to those at time + h, in place."""
+    if is_a(frame, InertialFrame):
+        return lambda frame, state, time, h: None
+
+    def rotate_back(frame, state, time, h):
+        a, b, c = frame_rate(frame, time + 0.5 * h)
+        x, y, z = -h * a, -h * b, -h * c
+        if len(state.position):
+            rotate_in_place(state.position[0], x, y, z)
+            rotate_in_place(state.velocity[0], x, y, z)
+        for k in range(len(state.rotation)):
+            for column in range(3):
+                rotate_in_place(state.rotation[k, :, column], x, y, z)
+
+    return rotate_back
+
+
+@kernel(inline=True)
+def rotate_in_place(vector, x, y, z):
+    """Rotate a vector (3,) by the rotation vector (x, y, z), in place (Rodrigues)."""
+    angle = sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
+        return
+    s, versine = sine_and_versine(angle)
+    vector[0], vector[1], vector[2] = rotate_vector(
+        vector[0], vector[1], vector[2], x / angle, y / angle, z / angle, s, versine
+    )
+
+
+@chosen_by_type(inline=True)
+def frame_rate(frame, time):
+    """Angular velocity of the frame along its axes, as a tuple."""
+    if is_a(frame, InertialFrame):
+        return lambda frame, time: (0.0, 0.0, 0.0)
+
+    def rate(frame, time):
+        omega = frame.angular_velocity
+        return value(omega, time, 0), value(omega, time, 1), value(omega, time, 2)
+
+    return rate

@@ -12,11 +12,11 @@ from scipy.special import erf
 from rigidmd.assemble.build import build
 from rigidmd.core.state import Load, State
 from rigidmd.dynamics.barostats import COMPONENTS
-from rigidmd.dynamics.momenta import mobile
+from rigidmd.dynamics.model import mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.direct_sum import EwaldSum
-from rigidmd.forces.ewald.errors import charges_of, k_cutoff_of_count, k_space_error, pme_error, real_error
+from rigidmd.forces.ewald.errors import charges_in, k_cutoff_of_count, k_space_error, pme_error, real_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
@@ -62,9 +62,7 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
-    charged = [m.charges != 0 for m in system.species]
-    species = zip(counts, system.species, charged, strict=True)
-    charges = charges_of([(int(n), m.charges[c], m.positions_body[c]) for n, m, c in species])
+    charges = charges_in(system.species, counts)
     if isinstance(term, EwaldSum):
         reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
     else:

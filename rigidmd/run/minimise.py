@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidmd.core.state import WORK, Load, State
 from rigidmd.dynamics.barostats import COMPONENTS, COUPLINGS, LONGEST_DRIFT
-from rigidmd.dynamics.momenta import mobile
+from rigidmd.dynamics.model import mobile
 from rigidmd.engines.cpu.engine import BehindWallError
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System

@@ -11,12 +11,11 @@ from pydantic import Field, Strict, field_validator
 
 from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY, written
-from rigidmd.mechanics.inertia import inertia_error, shifted_inertia
+from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION, SOLIDS, inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates, from_attitude_matrix, from_euler_angles, from_quaternion, from_yaw_pitch_roll,
     nearest_rotation, orthogonality_error, unit_vector,
 )  # fmt: skip
-from rigidmd.mechanics.solids import COMPONENTS_PER_DIMENSION, SOLIDS
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.body_forces import (
     Applied, ChangingInertia, Fluid, Frame, Friction, Gravity, NonNegativeVector, PositiveVector, Wheel,

@@ -8,8 +8,8 @@ import numpy as np
 from rigidmd.assemble.body import inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.io.formats.bonds import shortest_links
+from rigidmd.mechanics.inertia import SOLIDS
 from rigidmd.mechanics.rotation import unit_vector
-from rigidmd.mechanics.solids import SOLIDS
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
 #: Corners of a circle; least thickness of a body, as a fraction of its reach.

@@ -143,11 +143,11 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
     """Times of the kernels of a law between pairs, whose list is built anew every so many steps."""
     load = no_load(state)
     pairs, blocks = term.pairs, len(term.pairs.needed)
-    code, lists, content = term.code, term.list_code, (term.slot_potential, pairs, term.sums)
+    code, lists, content = term.code, term.list_code, (term.slot_potential, pairs, term.sums, None, None)
     placed, on_sites = (pairs, term.sites, state), (term.sites, state, load, term.forces_in_slots)
     lanes, useful = lanes_of(term), useful_pairs(term, state)
     forces = milliseconds(run_blocks, code, "forces", content, blocks)
-    gather = milliseconds(run_blocks, code, "gather", content, blocks)
+    gather = milliseconds(run_blocks, code, "gather", (pairs, term.sums, None), blocks)
     follow = milliseconds(run_blocks, lists, "displacements", pairs, blocks)
     place = milliseconds(run_blocks, lists, "local", placed, blocks)
     loads = milliseconds(run_blocks, code, "load", on_sites, blocks_of(len(state.position)))
@@ -170,7 +170,8 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
 def of_mesh(term: NamedTuple) -> dict[str, float]:
     """Times of the kernels of the mesh, ms."""
     content, blocks = (term.alpha, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
-    times = {task: milliseconds(run_blocks, term.code, task, content, blocks) for task in MESH}
+    content_of = {"convolve": (term.alpha, term.mesh, None)}
+    times = {task: milliseconds(run_blocks, term.code, task, content_of.get(task, content), blocks) for task in MESH}
     return times | {"sort": milliseconds(run_once, term.code, "sort", content)}
 
 

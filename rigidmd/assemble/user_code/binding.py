@@ -14,7 +14,7 @@ from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
 from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
-from rigidmd.dynamics.momenta import count_degrees_of_freedom
+from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.errors import SceneError, describe_error

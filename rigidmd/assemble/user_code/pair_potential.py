@@ -16,7 +16,7 @@ from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, sites_named
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
-    DISTANCE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table, formula_of_text,
+    DISTANCE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table,
 )  # fmt: skip
 from rigidmd.forces.potentials.truncation import (
     MINIMUM_TOLERANCE, TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
@@ -79,6 +79,8 @@ class PairLaw:
                 r, energy, force, name = self.table
                 return formula_of_table(r, energy, cutoff, force, name)
             if isinstance(self.energy, str):
+                from rigidmd.forces.potentials.text_formulas import formula_of_text  # SymPy is slow to import
+
                 return formula_of_text(self.energy, self.constants)
         except FormulaError as error:
             raise PairPotentialError(str(error)) from None

@@ -34,7 +34,7 @@ from rigidmd.dynamics.step_loop import Advance, advance_body, flow_arrays, molec
 from rigidmd.dynamics.thermostats import NoThermostat, thermostat_workspace
 from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.errors import SimulationError
-from rigidmd.forces.fields.walls import LennardJonesWalls, SiteBehindWall
+from rigidmd.forces.fields.walls import LennardJonesWalls
 from rigidmd.forces.terms import (
     NoForce,
     Setup,
@@ -165,7 +165,7 @@ class CpuEngine(Engine):
             self._bound_flows = integrator, self._flow_arguments(integrator, state)
         model, rest = self.model_for(integrator), self._bound_flows[1]
         cursor = np.array([0, not self._stale, 0], np.int64)
-        while status := advance_body(model, state, load, workspaces, *rest, *step, cursor):
+        while status := advance_body(model, None, state, load, workspaces, *rest, *step, cursor):
             workspaces = self._handle_status(status, state)
         return cursor[1] != 0  # also False after no step, because then no forces were evaluated
 
@@ -330,7 +330,7 @@ class CpuEngine(Engine):
             raise NotFiniteError(state)
         elif status == BEHIND_WALL:
             found = [workspace.behind(state) for workspace in workspaces if isinstance(workspace, LennardJonesWalls)]
-            raise BehindWallError(next(behind for behind in found if behind is not None))
+            raise BehindWallError(*next(behind for behind in found if behind is not None))
         elif status == NEEDS_PYTHON_FORCES:
             for name, workspace in zip(self.names, workspaces, strict=False):
                 if name in self._python_forces:
@@ -364,7 +364,6 @@ def _check_arrays(state: State) -> None:
 
 
 class BehindWallError(SimulationError):
-    def __init__(self, behind: SiteBehindWall):
-        self.molecule = behind.molecule
-        self.reason = str(behind)
+    def __init__(self, molecule: int, reason: str):
+        self.molecule, self.reason = molecule, reason
         super().__init__(f"molecule {self.molecule + 1} {self.reason}")

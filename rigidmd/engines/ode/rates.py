@@ -5,12 +5,11 @@ from math import hypot, sin
 from rigidmd.compile import kernel
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK
 from rigidmd.dynamics.body_step_loop import relative_motion
-from rigidmd.forces.body.frame import frame_rate
 from rigidmd.forces.body.resistance import add_resistance
 from rigidmd.forces.terms import compute_body_load, total_power
 from rigidmd.mechanics.free_rotor import moment_rates
 from rigidmd.mechanics.odes import attitude_rates, write_rotation
-from rigidmd.mechanics.translation import body_component, inertial_mass
+from rigidmd.mechanics.translation import body_component, frame_rate, inertial_mass
 
 SINGULAR = 5  # status code beyond those of core.state: Euler angles too near theta = 0 or pi
 #: Below this sine, half of the digits of phi and psi are lost, because theta has an error of 1e-16.
@@ -51,7 +50,7 @@ def write_rates(form, model, terms, state, load, time, y, dy):
     W' = the power of drives and resistance, relative to the frame, and of changes of I and h.
     """
     read(form, model, state, time, y)
-    status = compute_body_load(terms, state, load, None)
+    status = compute_body_load(terms, state, load)
     if status != OK:
         return status
     velocity, omega = relative_motion(model, state)

@@ -1,1 +1,1 @@
-"""What acts on a single body: fields, resistance, and the frame of reference."""
+"""What acts on a single body: fields and resistance."""

@@ -9,7 +9,7 @@ from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NEEDS_PYTHON_FORCES, OK, State
 from rigidmd.forces.terms import Setup, add_forces, power
 from rigidmd.mechanics.time_functions import TimeFunction, value
-from rigidmd.mechanics.translation import body_component
+from rigidmd.mechanics.translation import body_component, body_vector
 
 
 class SteadyForce(NamedTuple):
@@ -103,9 +103,7 @@ def steady_energies(term, position, rotation):
 @kernel(inline=True)
 def add_torque(point, rotation, force_lab, torque_body):
     """Add point x Q^T F to a torque (3,), all in the body frame."""
-    a = body_component(rotation, force_lab, 0)
-    b = body_component(rotation, force_lab, 1)
-    c = body_component(rotation, force_lab, 2)
+    a, b, c = body_vector(rotation, force_lab)
     torque_body[0] += point[1] * c - point[2] * b
     torque_body[1] += point[2] * a - point[0] * c
     torque_body[2] += point[0] * b - point[1] * a

@@ -12,9 +12,8 @@ import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.core.state import WORK
-from rigidmd.forces.body.frame import frame_rate
 from rigidmd.mechanics.free_rotor import NoRotor, moments
-from rigidmd.mechanics.translation import NoTranslation, body_component, inertial_mass
+from rigidmd.mechanics.translation import NoTranslation, body_component, body_vector, frame_rate, inertial_mass
 
 MAX_ITERATIONS = 100  # for |v|; about six are needed
 SPEED_TOLERANCE = 1e-14  # relative error of |v|
@@ -72,7 +71,7 @@ def kick_rotation(resistance, rotor, frame, state, load, h):
     i1, h1 = moments(rotor, state.time[0], 1)
     i2, h2 = moments(rotor, state.time[0], 2)
     inverse, carried = (i0, i1, i2), (h0, h1, h2)
-    dragged = (body_component(q, W, 0), body_component(q, W, 1), body_component(q, W, 2))
+    dragged = body_vector(q, W)
     before = ((L[0] - h0) * i0 - dragged[0], (L[1] - h1) * i1 - dragged[1], (L[2] - h2) * i2 - dragged[2])
     torque = load.torque_body[0]
     pushes = (i0 * torque[0], i1 * torque[1], i2 * torque[2])
@@ -148,21 +147,10 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
         inverse = (1 / mass[0], 1 / mass[1], 1 / mass[2])
         if turns:
             q = state.rotation[0]
-            velocity_per_momentum = (
-                translation.mass * inverse[0],
-                translation.mass * inverse[1],
-                translation.mass * inverse[2],
-            )
-            before = (
-                velocity_per_momentum[0] * body_component(q, V, 0) - body_component(q, wind, 0),
-                velocity_per_momentum[1] * body_component(q, V, 1) - body_component(q, wind, 1),
-                velocity_per_momentum[2] * body_component(q, V, 2) - body_component(q, wind, 2),
-            )
-            pulls = (
-                body_component(q, F, 0) * inverse[0],
-                body_component(q, F, 1) * inverse[1],
-                body_component(q, F, 2) * inverse[2],
-            )
+            v, u, f = body_vector(q, V), body_vector(q, wind), body_vector(q, F)
+            per_momentum = (translation.mass * inverse[0], translation.mass * inverse[1], translation.mass * inverse[2])
+            before = (per_momentum[0] * v[0] - u[0], per_momentum[1] * v[1] - u[1], per_momentum[2] * v[2] - u[2])
+            pulls = (f[0] * inverse[0], f[1] * inverse[1], f[2] * inverse[2])
         else:
             before = (V[0] - wind[0], V[1] - wind[1], V[2] - wind[2])
             pulls = (F[0] * inverse[0], F[1] * inverse[1], F[2] * inverse[2])

@@ -9,7 +9,7 @@ from scipy.special import erf
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
 from rigidmd.forces import terms
-from rigidmd.forces.neighbors.sites import BodySites, CentralSites, compute_site_positions, load_from_sites
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, compute_site_positions, load_molecule
 from rigidmd.forces.neighbors.space import volume_of
 from rigidmd.forces.terms import Setup
 
@@ -78,7 +78,8 @@ def _add_surface_dipole(term, state, load, tally):
                 for k in range(3):
                     m = term.sites.molecule[i]
                     tally[1 + 3 * row + k] += term.site_force[i, row] * state.position[m, k]
-    load_from_sites(term.sites, state, load, term.site_force)
+    for m in range(len(state.position)):
+        load_molecule(term.sites, state, load, m, term.site_force)
     return OK
 
 

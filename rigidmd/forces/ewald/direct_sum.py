@@ -22,18 +22,91 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import Code, call_blocks, implements, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import BLOCKS, Code, call_blocks, implements, kernel, load_arguments, pack_arguments, task
 from rigidmd.compile.simd import broadcast, lane_count, lanes_of, load, store, sum_lanes
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.ewald.k_vectors import KVectors
 from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, blocks_of, site_tasks, to_molecular_virial, virial_buffer,
+    BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
 )  # fmt: skip
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
 
-WIDTH = lane_count(np.float64)
+SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its description
+
+
+class KVectors(NamedTuple):
+    """Half of the vectors n = (n_x, n_y, n_z) of a sum, in columns along n_z; the other half are minus these."""
+
+    column: np.ndarray  # (columns, 4) n_x, n_y, first n_z, index of that vector in the sum
+    count: np.ndarray  # (columns,) number of n_z
+    most: np.ndarray  # (3,) largest |n| along each axis
+    bounds: np.ndarray  # (blocks + 1,) block b has columns bounds[b] ... bounds[b + 1] - 1
+
+    @property
+    def total(self) -> int:
+        """Number of vectors, with their negatives."""
+        return 2 * int(self.count.sum())
+
+
+def k_vectors_up_to(
+    most: tuple[int, int, int], largest_square: int | None = None, basis: np.ndarray = SAME_BASIS
+) -> KVectors:
+    """All n != 0 with |n_x|, |n_y|, |n_z| up to `most`, and with |n|² up to `largest_square` if given.
+
+    basis (3, 3) : integers; the edges of this cell are `basis` times those of another cell of the same lattice, and the
+        bounds apply to n in that cell
+    """
+    square = np.inf if largest_square is None else largest_square
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        other = _in_other(n, basis)
+        return (np.abs(other) <= most).all(axis=-1) & ((other**2).sum(axis=-1) <= square)
+
+    return _in_columns(np.abs(basis) @ most, inside)
+
+
+def k_vectors_within(
+    reciprocal: np.ndarray, radius: float, limit: tuple[int, int, int] | None = None, basis: np.ndarray = SAME_BASIS
+) -> KVectors:
+    """All n != 0 with |k| up to `radius` (1/Å), and with |n_x|, |n_y|, |n_z| up to `limit` if given.
+
+    reciprocal (3, 3) : rows 2 pi times the reciprocal edges, 1/Å
+    basis : for the limit, see `k_vectors_up_to`
+    """
+    cell = 2 * pi * np.linalg.inv(reciprocal).T
+    most = np.floor(radius * np.linalg.norm(cell, axis=1) / (2 * pi)).astype(int)
+
+    def inside(n: np.ndarray) -> np.ndarray:
+        short = ((n @ reciprocal) ** 2).sum(axis=-1) <= radius**2
+        return short if limit is None else short & (np.abs(_in_other(n, basis)) <= limit).all(axis=-1)
+
+    return _in_columns(most if limit is None else np.minimum(most, np.abs(basis) @ limit), inside)
+
+
+def _in_other(n: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """The n (..., 3) of the same k-vectors in the other cell, see `k_vectors_up_to`."""
+    return n @ np.rint(np.linalg.inv(basis)).astype(int).T
+
+
+def _in_columns(most, inside) -> KVectors:
+    mx, my, mz = (int(m) for m in most)
+    z = np.arange(-mz, mz + 1)
+    columns, counts = [], []
+    for x in range(mx + 1):
+        y = np.arange(-my if x else 0, my + 1)
+        n = np.stack(np.broadcast_arrays(x, y[:, None], z), axis=-1)
+        found = inside(n) & ((x > 0) | (y[:, None] > 0) | (z > 0))
+        here = np.flatnonzero(found.any(axis=1))
+        columns.append(np.stack([np.full(len(here), x), y[here], z[found[here].argmax(axis=1)]], axis=1))
+        counts.append(np.count_nonzero(found[here], axis=1))
+    count = np.concatenate(counts).astype(np.int64)
+    ends = np.cumsum(count)
+    total = int(count.sum())
+    blocks = max(1, min(BLOCKS, len(count)))
+    block_ends = np.searchsorted(ends, np.linspace(0, total, blocks + 1)[1:-1])
+    column = np.column_stack([np.concatenate(columns), ends - count]).astype(np.int64)
+    return KVectors(column, count, np.array([mx, my, mz]), np.array([0, *block_ends, len(count)], np.int64))
 
 
 class KSpaceSums(NamedTuple):
@@ -64,7 +137,7 @@ class EwaldSum(NamedTuple):
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
         s, k_vectors = len(self.charge), self.k_vectors
-        slots = -(-s // WIDTH) * WIDTH
+        slots = -(-s // lane_count(np.float64)) * lane_count(np.float64)
         angles = (3, int(k_vectors.most.max()) + 1, slots)
         sums = KSpaceSums(
             cell=np.zeros((3, 3)), reciprocal=np.zeros((3, 3)), position=np.zeros((s, 3)), force=np.zeros((s, 3)),
@@ -89,10 +162,12 @@ class EwaldWorkspace(NamedTuple):
         return self.sums.force
 
     def with_code(self) -> "EwaldWorkspace":
-        content = (self.alpha, self.k_vectors, self.sums)
-        moved = site_tasks(self.sites, self.sums.position, self.sums.force, self.sums.virial)
-        tasks = {"phases": _compute_phases, "sum": _sum_structure_factors, "forces": _compute_forces}
-        return self._replace(code=Code(**{name: (one, content) for name, one in tasks.items()}, **moved))
+        sums, content = self.sums, (self.alpha, self.k_vectors, self.sums)
+        code = Code(
+            phases=(_compute_phases, content), sum=(_sum_structure_factors, content), forces=(_compute_forces, content),
+            **position_task(self.sites, sums.position), **load_tasks(self.sites, sums.force, sums.virial),
+        )  # fmt: skip
+        return self._replace(code=code)
 
 
 @kernel
@@ -113,38 +188,29 @@ def invert_cell(cell, reciprocal):
 
 @implements(terms.add_forces, EwaldWorkspace, count_references=False)
 def _add_ewald_sum(term, state, load, tally):
-    sums = term.sums
-    placed, molecules = pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position))
-    call_blocks(term.code, "positions", placed, molecules)
+    code, sums = term.code, term.sums
+    call_blocks(code, "positions", pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position)))
     if follow_cell(state.cell, sums.cell):
         volume = abs(invert_cell(sums.cell, sums.reciprocal))
         _set_strengths(term.k_vectors, sums, term.alpha, volume)
     arguments = pack_arguments((term.alpha, term.k_vectors, sums))
     blocks = len(sums.tallies)
-    call_blocks(term.code, "phases", arguments, blocks)
-    call_blocks(term.code, "sum", arguments, blocks)
-    call_blocks(term.code, "forces", arguments, blocks)
-    if tally is not None:
-        for block in range(blocks):
-            for k in range(len(tally)):
-                tally[k] += sums.tallies[block, k]
-        to_molecular_virial(term.sites, term.code, state, sums.force, sums.virial, tally)
-    call_blocks(term.code, "load", pack_arguments((term.sites, state, load, sums.force)), molecules)
+    call_blocks(code, "phases", arguments, blocks)
+    call_blocks(code, "sum", arguments, blocks)
+    call_blocks(code, "forces", arguments, blocks)
+    load_from_blocks(term.sites, code, state, load, sums.force, sums, tally)
     return OK
 
 
 @kernel
 def _set_strengths(k_vectors, sums, alpha, volume):
-    for c in range(len(k_vectors.column)):
-        first = k_vectors.column[c, 3]
+    column, b = k_vectors.column, sums.reciprocal
+    for c in range(len(column)):
+        first = column[c, 3]
         for n in range(k_vectors.count[c]):
             k2 = 0.0
             for d in range(3):
-                k = (
-                    k_vectors.column[c, 0] * sums.reciprocal[0, d]
-                    + k_vectors.column[c, 1] * sums.reciprocal[1, d]
-                    + (k_vectors.column[c, 2] + n) * sums.reciprocal[2, d]
-                )
+                k = column[c, 0] * b[0, d] + column[c, 1] * b[1, d] + (column[c, 2] + n) * b[2, d]
                 k2 += k * k
             sums.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
 
@@ -186,10 +252,10 @@ def _times(a, b):
 def _sum_structure_factors(arguments, block):
     """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength for the forces."""
     alpha, k_vectors, sums = load_arguments(arguments)
-    width = lanes_of(sums.charge)
+    column, width = k_vectors.column, lanes_of(sums.charge)
     sums.tallies[block] = 0.0
     for c in range(k_vectors.bounds[block], k_vectors.bounds[block + 1]):
-        first, count = k_vectors.column[c, 3], k_vectors.count[c]
+        first, count = column[c, 3], k_vectors.count[c]
         for n in range(count):
             sums.real[first + n] = 0.0
             sums.imaginary[first + n] = 0.0
@@ -200,41 +266,35 @@ def _sum_structure_factors(arguments, block):
                 real = broadcast(0.0, sums.charge)
                 imaginary = broadcast(0.0, sums.charge)
                 for at in range(batch, end, width):
-                    plane = _times(
-                        _phase(sums, 0, k_vectors.column[c, 0], at), _phase(sums, 1, k_vectors.column[c, 1], at)
-                    )
-                    phase = _times(plane, _phase(sums, 2, k_vectors.column[c, 2] + n, at))
+                    plane = _times(_phase(sums, 0, column[c, 0], at), _phase(sums, 1, column[c, 1], at))
+                    phase = _times(plane, _phase(sums, 2, column[c, 2] + n, at))
                     charge = load(sums.charge, at)
                     real = real + charge * phase[0]
                     imaginary = imaginary + charge * phase[1]
                 sums.real[first + n] += sum_lanes(real)
                 sums.imaginary[first + n] += sum_lanes(imaginary)
-        for n in range(count):
-            nz, index = k_vectors.column[c, 2] + n, first + n
-            _add_k_vector(sums, alpha, k_vectors.column[c, 0], k_vectors.column[c, 1], nz, index, block)
+        for n in range(first, first + count):
+            real, imaginary, strength = sums.real[n], sums.imaginary[n], sums.strength[n]
+            sums.real[n], sums.imaginary[n] = 2 * strength * real, 2 * strength * imaginary
+            energy = strength * (real * real + imaginary * imaginary)
+            vector = (column[c, 0], column[c, 1], column[c, 2] + n - first)
+            add_k_vector(sums.tallies[block], energy, vector, sums.reciprocal, alpha)
 
 
 @kernel(inline=True, count_references=False)
-def _add_k_vector(sums, alpha, nx, ny, nz, index, block):
-    tally = sums.tallies[block]
-    real, imaginary, strength = sums.real[index], sums.imaginary[index], sums.strength[index]
-    energy = strength * (real * real + imaginary * imaginary)
-    sums.real[index] = 2 * strength * real
-    sums.imaginary[index] = 2 * strength * imaginary
+def add_k_vector(tally, energy, n, b, alpha):
+    """Add energy and virial of k = 2 pi n times the reciprocal edges, with the rows of b (3, 3) 2 pi times these.
+
+    The energy is proportional to |S|² exp(-k²/4 alpha²)/(k² V), and the virial is energy (1 - slope k k) with slope =
+    2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055).
+    """
     k = (
-        nx * sums.reciprocal[0, 0] + ny * sums.reciprocal[1, 0] + nz * sums.reciprocal[2, 0],
-        nx * sums.reciprocal[0, 1] + ny * sums.reciprocal[1, 1] + nz * sums.reciprocal[2, 1],
-        nx * sums.reciprocal[0, 2] + ny * sums.reciprocal[1, 2] + nz * sums.reciprocal[2, 2],
+        n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
+        n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],
+        n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
     )
-    k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
+    slope = 2 / (k[0] * k[0] + k[1] * k[1] + k[2] * k[2]) + 1 / (2 * alpha * alpha)
     tally[0] += energy
-    add_k_vector_virial(tally, energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
-
-
-@kernel(inline=True)
-def add_k_vector_virial(tally, energy, k, slope):
-    """Add the virial energy (1 - slope k k) of a k-vector, its energy proportional to |S|² exp(-k²/4 alpha²)/(k² V).
-    slope = 2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055)"""
     for row in range(3):
         for column in range(3):
             unit = 1.0 if row == column else 0.0
@@ -244,22 +304,21 @@ def add_k_vector_virial(tally, energy, k, slope):
 @task(count_references=False)
 def _compute_forces(arguments, block):
     _alpha, k_vectors, sums = load_arguments(arguments)
-    width = lanes_of(sums.charge)
+    column, width = k_vectors.column, lanes_of(sums.charge)
     blocks, vectors = len(sums.tallies), len(sums.charge) // width
     for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):
         zero = broadcast(0.0, sums.charge)
         fx, fy, fz = zero, zero, zero
-        for c in range(len(k_vectors.column)):
-            plane = _times(_phase(sums, 0, k_vectors.column[c, 0], at), _phase(sums, 1, k_vectors.column[c, 1], at))
+        for c in range(len(column)):
+            plane = _times(_phase(sums, 0, column[c, 0], at), _phase(sums, 1, column[c, 1], at))
             flat, high = zero, zero
             for n in range(k_vectors.count[c]):
-                z = k_vectors.column[c, 2] + n
+                z, index = column[c, 2] + n, column[c, 3] + n
                 phase = _times(plane, _phase(sums, 2, z, at))
-                index = k_vectors.column[c, 3] + n
                 push = phase[1] * sums.real[index] - phase[0] * sums.imaginary[index]
                 flat = flat + push
                 high = high + push * (z + 0.0)
-            x, y = k_vectors.column[c, 0] + 0.0, k_vectors.column[c, 1] + 0.0
+            x, y = column[c, 0] + 0.0, column[c, 1] + 0.0
             fx = fx + flat * (x * sums.reciprocal[0, 0] + y * sums.reciprocal[1, 0]) + high * sums.reciprocal[2, 0]
             fy = fy + flat * (x * sums.reciprocal[0, 1] + y * sums.reciprocal[1, 1]) + high * sums.reciprocal[2, 1]
             fz = fz + flat * (x * sums.reciprocal[0, 2] + y * sums.reciprocal[1, 2]) + high * sums.reciprocal[2, 2]

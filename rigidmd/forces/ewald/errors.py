@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from rigidmd.forces.ewald.splines import aliases
-
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 MAX_PROXY_POINTS = 32  # along an edge in estimates: errors depend on the spacing, not on the number of points
 ORDERS = (4, 5, 6, 7, 8)
@@ -37,10 +35,11 @@ class Charges(NamedTuple):
         return found
 
 
-def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
-    """The `Charges` of species, each given as (number of molecules, charges (s,) in e, positions (s, 3) in Å)."""
+def charges_in(species: list[Any], counts: np.ndarray) -> Charges:
+    """The charges of `counts` molecules of each species, each a `scene.models.Molecule`."""
     square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
-    for n, charge, position in molecules:
+    for m, n in zip(species, map(int, counts), strict=True):
+        charge, position = m.charges[m.charges != 0], m.positions_body[m.charges != 0]
         count += n * len(charge)
         square += n * float(charge @ charge)
         i, j = np.tril_indices(len(charge), -1)
@@ -50,25 +49,12 @@ def charges_of(molecules: list[tuple[int, np.ndarray, np.ndarray]]) -> Charges:
             product, distance = np.bincount(bins, product), COARSE * np.arange(bins.max() + 1)
         products.append(product)
         distances.append(np.round(distance, FINE))
-    return Charges(count, square, _by_distance(np.concatenate(products), np.concatenate(distances)))
-
-
-def charges_in(species: list[Any], counts: np.ndarray) -> Charges:
-    """The charges of `counts` molecules of each species, each a `scene.models.Molecule`."""
-    charged = [(m, m.charges != 0) for m in species]
-    return charges_of(
-        [(int(n), m.charges[some], m.positions_body[some]) for n, (m, some) in zip(counts, charged, strict=True)]
-    )
-
-
-def _by_distance(products: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Sums of products (p,) over pairs of one distance, with these distances, (d, 2), in order of appearance."""
-    _, first, which = np.unique(distances, return_index=True, return_inverse=True)
-    sums = np.zeros(len(first))
-    np.add.at(sums, which, products)
-    order = np.argsort(first)
-    rounded = [round(distance, FINE) for distance in distances[first[order]].tolist()]
-    return np.array([sums[order], rounded]).T.copy()
+    # sums of the products over pairs of one distance, in order of appearance
+    distance, first, which = np.unique(np.concatenate(distances), return_index=True, return_inverse=True)
+    sums, order = np.zeros(len(first)), np.argsort(first)
+    np.add.at(sums, which, np.concatenate(products))
+    rounded = [round(d, FINE) for d in distance[order].tolist()]
+    return Charges(count, square, np.array([sums[order], rounded]).T.copy())
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
@@ -185,12 +171,37 @@ def pme_grid_for(
             else:
                 low = middle + 1
         if low < len(grids):
-            cost = pme_time(charges.count, grids[low], p)
+            # approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³
+            cost = charges.count * (20 + 2.4 * p**2) + 8.0 * float(np.prod(grids[low]))
             if best is None or cost < best[0]:
                 best = (cost, grids[low], p)
     return best[1:] if best else None
 
 
-def pme_time(sites: int, grid: tuple[int, int, int], order: int) -> float:
-    """Approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³."""
-    return sites * (20 + 2.4 * order**2) + 8.0 * float(np.prod(grid))
+ALIASES = 30  # largest |m| in sums; its term is 1e-7 of the first for order 3, less for higher orders
+
+
+class Aliases(NamedTuple):
+    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an FFT. A grid of K
+    points cannot distinguish a Fourier component n from its aliases n + m K. Spreading charges by B-splines (see
+    `pme.weights`) multiplies these by U(n + m K) = sinc((n + m K)/K)^p."""
+
+    n: np.ndarray  # -K/2 < n <= K/2
+    odd: np.ndarray  # n, but 0 where n and -n are the same component
+    unaliased: np.ndarray  # U(n)²
+    all: np.ndarray  # sum over m of U(n + m K)²
+    first: np.ndarray  # sum of (n + m K) U²
+    second: np.ndarray  # sum of (n + m K)² U²
+
+
+def aliases(points: int, order: int) -> Aliases:
+    n = np.arange(points)
+    n = np.where(2 * n > points, n - points, n)
+    every = n[:, None] + points * np.arange(-ALIASES, ALIASES + 1)
+    squared = np.sinc(every / points) ** (2 * order)
+    nyquist = 2 * n == points
+    first = np.where(nyquist, 0.0, (every * squared).sum(axis=1))
+    return Aliases(
+        n, np.where(nyquist, 0, n), np.sinc(n / points) ** (2 * order), squared.sum(axis=1), first,
+        (every**2 * squared).sum(axis=1),
+    )  # fmt: skip

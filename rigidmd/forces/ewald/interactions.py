@@ -1,24 +1,16 @@
 """Ewald sums of a scene, electrostatics = "ewald" and "pme": settings, terms, constants of rigid molecules."""
 
+# isort: skip_file
 from math import inf, pi, prod, sqrt
 from typing import Any
 
 import numpy as np
 
 from rigidmd.errors import SceneError
-from rigidmd.forces.ewald import corrections, direct_sum, k_vectors
+from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF,
-    MAX_GRID_POINTS,
-    SPACINGS,
-    alpha_for,
-    charges_in,
-    k_cutoff_for,
-    k_cutoff_of_count,
-    k_space_error,
-    pme_error,
-    pme_grid_for,
-    real_error,
+    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, k_cutoff_for, k_cutoff_of_count, k_space_error,
+    pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
@@ -73,7 +65,7 @@ def settings(forces: Any, composition: Composition, cutoff: float) -> Settings:
             return Settings(numbers, [f"forces.electrostatics = 'ewald' {fault}: {advice}"])
         return Settings(numbers | {"ewald_k_radius_per_A": radius}, [])
     grid, order = forces.pme_grid, forces.pme_order
-    has_given_cell = np.array_equal(composition.basis, k_vectors.SAME_BASIS)
+    has_given_cell = np.array_equal(composition.basis, direct_sum.SAME_BASIS)
     if grid is not None and len(set(grid)) > 1 and not has_given_cell:
         fault = (
             f"forces.pme_grid = {list(grid)} refers to the edges of a cell with a large tilt; the box is the "
@@ -110,7 +102,7 @@ def _number_of_k_vectors(forces: Any, radius: float | None, volume: float) -> fl
     return min(boxed, inf if radius is None else radius**3 * volume / (6 * pi**2))
 
 
-def _errors(parts: SystemParts) -> tuple[float, float, k_vectors.KVectors | None]:
+def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | None]:
     """Errors of real space and of k-space (e²/Å², see `ewald.errors`), and the k-vectors; with PME these are only for
     the interactions of frozen molecules, and None without any. Raises SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
@@ -119,15 +111,15 @@ def _errors(parts: SystemParts) -> tuple[float, float, k_vectors.KVectors | None
     if parts.grid is not None:
         error, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
         if not parts.moves[parts.model.species].all():
-            vectors = k_vectors.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error))
+            vectors = direct_sum.k_vectors_within(reciprocal, k_cutoff_for(charges, alpha, reciprocal, 1e-3 * error))
         return real, error, vectors
     most, radius = forces.ewald_k_max, forces.ewald_k_radius_per_A
     if isinstance(most, int):
         most = (most, most, most)
     if radius is None:
-        vectors = k_vectors.k_vectors_up_to(most, forces.ewald_k2_max, parts.basis)
+        vectors = direct_sum.k_vectors_up_to(most, forces.ewald_k2_max, parts.basis)
     else:
-        vectors = k_vectors.k_vectors_within(reciprocal, radius, most, parts.basis)
+        vectors = direct_sum.k_vectors_within(reciprocal, radius, most, parts.basis)
     if vectors.total == 0:
         raise SceneError(parts.scene.source, ["forces.ewald_k_max or ewald_k_radius_per_A leaves no k-vector"])
     return real, k_space_error(charges, alpha, k_cutoff_of_count(vectors.total, volume), volume), vectors
@@ -143,7 +135,7 @@ def interactions(parts: SystemParts) -> Interactions:
         assert vectors is not None  # with PME only, there may be none
         reciprocal = direct_sum.EwaldSum(alpha, charge, sites, vectors)
         how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
-        if forces.ewald_k_max is not None and not np.array_equal(parts.basis, k_vectors.SAME_BASIS):
+        if forces.ewald_k_max is not None and not np.array_equal(parts.basis, direct_sum.SAME_BASIS):
             how += "; they are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
@@ -188,7 +180,7 @@ def interactions(parts: SystemParts) -> Interactions:
 
 
 def _frozen_correction(
-    parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray, vectors: k_vectors.KVectors
+    parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray, vectors: direct_sum.KVectors
 ) -> tuple[float, float]:
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
     (s,) is 0 for sites that move."""

@@ -16,23 +16,24 @@ same bit for bit. This module needs rocket-fft; only scenes with PME import it.
 """
 
 # isort: skip_file
-from math import pi
+from math import factorial, pi
 from typing import NamedTuple
 
 import numpy as np
 from rocket_fft import c2c, c2r, r2c
+from scipy.interpolate import BSpline
 
 from rigidmd.compile import (
-    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments,
-    pack_arguments, task,
+    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, chosen_by_type, implements, kernel, load_arguments, pack_arguments,
+    task,
 )  # fmt: skip
 from rigidmd.compile.simd import load_eight, load_four, store, sum_lanes
 from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
-from rigidmd.forces.ewald.direct_sum import add_k_vector_virial, invert_cell
-from rigidmd.forces.ewald.splines import aliases, weights
+from rigidmd.forces.ewald.direct_sum import add_k_vector, invert_cell
+from rigidmd.forces.ewald.errors import aliases
 from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, blocks_of, site_tasks, to_molecular_virial, virial_buffer,
+    BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
 )  # fmt: skip
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.terms import Setup
@@ -41,20 +42,21 @@ PLANES = 16  # of a block, if there are more blocks than the minimum
 SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on the main thread
 
 
-class LowOrderSpline(NamedTuple):
-    """Splines of order 3 and 4: weights as vectors of four."""
+def weights(order: int) -> np.ndarray:
+    """(order, order) coefficients [j, t] of u'^j in the weight of grid point floor(x) + t, u' = x - floor(x) - 1/2.
+    The cardinal B-spline M_p of an order p is a polynomial of degree p - 1 between neighbouring points, p points wide
+    and p - 2 times differentiable (Essmann et al. 1995, eq. 4.1)."""
+    spline = BSpline.basis_element(np.arange(order + 1), extrapolate=False)
+    middle = order - 0.5 - np.arange(order)
+    return np.array([spline.derivative(j)(middle) / factorial(j) if j else spline(middle) for j in range(order)])
+
+
+class Spline(NamedTuple):
+    """Splines of one order, with weights as vectors of four numbers up to order 4, of eight up to order 8."""
 
     nodes: tuple[int, ...]  # 0 ... order - 1; its length is a constant at compile time
-    value: np.ndarray  # (4 order,) coefficients of the weights, see splines.weights
-    slope: np.ndarray  # (4 (order - 1),) coefficients of their derivatives
-
-
-class HighOrderSpline(NamedTuple):
-    """Splines of order 5 to 8: weights as vectors of eight."""
-
-    nodes: tuple[int, ...]
-    value: np.ndarray
-    slope: np.ndarray
+    value: np.ndarray  # (width order,) coefficients of the weights, see `weights`
+    slope: np.ndarray  # (width (order - 1),) coefficients of their derivatives
 
 
 class PmeMesh(NamedTuple):
@@ -73,7 +75,7 @@ class PmeMesh(NamedTuple):
     grid: np.ndarray  # (n_a, n_b + order - 1, n_c + width) charges, then potential
     spectrum: np.ndarray  # (n_a, n_b, n_c//2 + 1)
     influence: np.ndarray  # (n_a, n_b, n_c//2 + 1) potential over charge, by Fourier component
-    alias: np.ndarray  # (3, 6, most points) splines.Aliases of the axes
+    alias: np.ndarray  # (3, 6, most points) errors.Aliases of the axes
     axes: np.ndarray  # (3, 1) indices of the axes, for the transforms
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
@@ -100,9 +102,7 @@ class Pme(NamedTuple):
         value = np.zeros((order, width))
         value[:, :order] = weights(order)
         slope = value[1:] * np.arange(1, order)[:, None]
-        spline = (LowOrderSpline if width == 4 else HighOrderSpline)(
-            tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind)
-        )
+        spline = Spline(tuple(range(order)), value.ravel().astype(kind), slope.ravel().astype(kind))
         table = np.zeros((3, 6, max(grid)))
         for d in range(3):
             table[d, :, : grid[d]] = aliases(grid[d], order)
@@ -125,7 +125,7 @@ class PmeWorkspace(NamedTuple):
     alpha: float
     charge: np.ndarray
     sites: BodySites | CentralSites
-    spline: LowOrderSpline | HighOrderSpline
+    spline: Spline
     mesh: PmeMesh
     code: Code | None = None
 
@@ -135,14 +135,15 @@ class PmeWorkspace(NamedTuple):
         return self.mesh.force
 
     def with_code(self) -> "PmeWorkspace":
-        content = (self.alpha, self.charge, self.spline, self.mesh)
-        tasks = {
-            "influence": _set_influence, "scale": _scale_positions, "sort": _sort_sites, "spread": _spread_charges,
-            "convolve": _convolve, "convolve_with_virial": _convolve_with_virial, "back": _transform_back,
-            "forces": _interpolate_forces,
-        }  # fmt: skip
-        moved = site_tasks(self.sites, self.mesh.position, self.mesh.force, self.mesh.virial)
-        return self._replace(code=Code(**{name: (one, content) for name, one in tasks.items()}, **moved))
+        mesh, content = self.mesh, (self.alpha, self.charge, self.spline, self.mesh)
+        code = Code(
+            influence=(_set_influence, content), scale=(_scale_positions, content), sort=(_sort_sites, content),
+            spread=(_spread_charges, content), convolve=(_convolve, (self.alpha, mesh, None)),
+            convolve_with_virial=(_convolve, (self.alpha, mesh, mesh.tallies)), back=(_transform_back, content),
+            forces=(_interpolate_forces, content), **position_task(self.sites, mesh.position),
+            **load_tasks(self.sites, mesh.force, mesh.virial),
+        )  # fmt: skip
+        return self._replace(code=code)
 
 
 @implements(terms.add_forces, PmeWorkspace, count_references=False)
@@ -150,8 +151,7 @@ def _add_pme(term, state, load, tally):
     code, mesh = term.code, term.mesh
     blocks = len(mesh.tallies)
     arguments = pack_arguments((term.alpha, term.charge, term.spline, mesh))
-    placed, molecules = pack_arguments((term.sites, state, mesh.position)), blocks_of(len(state.position))
-    call_blocks(code, "positions", placed, molecules)
+    call_blocks(code, "positions", pack_arguments((term.sites, state, mesh.position)), blocks_of(len(state.position)))
     if follow_cell(state.cell, mesh.cell):
         invert_cell(mesh.cell, mesh.reciprocal)
         call_blocks(code, "influence", arguments, blocks)
@@ -162,17 +162,12 @@ def _add_pme(term, state, load, tally):
     call(code, "sort", arguments)
     call_blocks(code, "spread", arguments, blocks)
     if tally is None:
-        call_blocks(code, "convolve", arguments, blocks)
+        call_blocks(code, "convolve", pack_arguments((term.alpha, mesh, None)), blocks)
     else:
-        call_blocks(code, "convolve_with_virial", arguments, blocks)
+        call_blocks(code, "convolve_with_virial", pack_arguments((term.alpha, mesh, mesh.tallies)), blocks)
     call_blocks(code, "back", arguments, blocks)
     call_blocks(code, "forces", arguments, blocks)
-    if tally is not None:
-        for block in range(blocks):
-            for k in range(len(tally)):
-                tally[k] += mesh.tallies[block, k]
-        to_molecular_virial(term.sites, code, state, mesh.force, mesh.virial, tally)
-    call_blocks(code, "load", pack_arguments((term.sites, state, load, mesh.force)), molecules)
+    load_from_blocks(term.sites, code, state, load, mesh.force, mesh, tally)
     return OK
 
 
@@ -215,13 +210,10 @@ def _scale_positions(arguments, block):
     """Positions of the sites of a block in grid cells."""
     _alpha, charge, _spline, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
+    r, b = mesh.position, mesh.reciprocal
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
         for d in range(3):
-            turns = (
-                mesh.position[i, 0] * mesh.reciprocal[d, 0]
-                + mesh.position[i, 1] * mesh.reciprocal[d, 1]
-                + mesh.position[i, 2] * mesh.reciprocal[d, 2]
-            ) * (0.5 / pi)
+            turns = (r[i, 0] * b[d, 0] + r[i, 1] * b[d, 1] + r[i, 2] * b[d, 2]) * (0.5 / pi)
             x = (turns - np.floor(turns)) * mesh.points[d]
             if not abs(x) < 1e9:
                 mesh.not_finite[block] = True
@@ -254,7 +246,7 @@ def _sort_sites(arguments, block):
 @chosen_by_type(inline=True, count_references=False)
 def load_vector(spline, array, index):
     """Numbers of an array from an index on, as a vector of four or eight, as the weights of the spline."""
-    if is_a(spline, LowOrderSpline):
+    if spline.types[0].count <= 4:
         return lambda spline, array, index: load_four(array, index)
     return lambda spline, array, index: load_eight(array, index)
 
@@ -321,14 +313,8 @@ def _spread_charges(arguments, block):
 
 @task(count_references=False)
 def _convolve(arguments, block):
-    alpha, _charge, _spline, mesh = load_arguments(arguments)
-    convolve_block(alpha, mesh, None, block)
-
-
-@task(count_references=False)
-def _convolve_with_virial(arguments, block):
-    alpha, _charge, _spline, mesh = load_arguments(arguments)
-    convolve_block(alpha, mesh, mesh.tallies, block)
+    alpha, mesh, tallies = load_arguments(arguments)
+    convolve_block(alpha, mesh, tallies, block)
 
 
 @kernel(inline=True, count_references=False)
@@ -345,19 +331,11 @@ def convolve_block(alpha, mesh, tallies, block):
                 value, strength = spectrum[x, y, z], mesh.influence[x, y, z]
                 spectrum[x, y, z] = value * strength
                 if tallies is not None and x + y + z > 0:
-                    n = (of[0, 0, x], of[1, 0, y], of[2, 0, z])
-                    k = (
-                        n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
-                        n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],
-                        n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
-                    )
-                    k2 = k[0] * k[0] + k[1] * k[1] + k[2] * k[2]
                     # components n_c and -n_c are stored once, unless they are the same
                     multiplicity = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = multiplicity * strength * (real * real + imaginary * imaginary)
-                    tallies[block, 0] += energy
-                    add_k_vector_virial(tallies[block], energy, k, 2 / k2 + 1 / (2 * alpha * alpha))
+                    add_k_vector(tallies[block], energy, (of[0, 0, x], of[1, 0, y], of[2, 0, z]), b, alpha)
     c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 

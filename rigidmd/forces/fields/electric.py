@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NOW, OK
 from rigidmd.forces.parts import SystemParts
 from rigidmd.forces.terms import add_forces, energy_rate
-from rigidmd.mechanics.translation import body_component
+from rigidmd.mechanics.translation import body_component, body_vector
 from rigidmd.units import VOLT_PER_NM
 
 
@@ -61,9 +61,7 @@ class OscillatingField(NamedTuple):
     tied_to_places = ElectricField.tied_to_places
 
 
-def term(
-    parts: SystemParts, fields: Any, where: str, faults: list[str]
-) -> ElectricField | OscillatingField | None:  # fmt: skip
+def term(parts: SystemParts, fields: Any, where: str, faults: list[str]) -> ElectricField | OscillatingField | None:
     """The term of fields.electric_V_per_nm."""
     if not any(fields.electric_V_per_nm):
         return None
@@ -78,17 +76,14 @@ def term(
     return OscillatingField(*steady, 2 * pi * fields.electric_frequency_per_ps, radians(fields.electric_phase_deg))
 
 
-@implements(add_forces)
+@implements(add_forces, ElectricField)
 def _add_electric_field(term, state, load, tally):
-    if is_a(term, ElectricField):
-        return lambda term, state, load, tally: _add_field(term, state, load, tally, 1.0)
-    if not is_a(term, OscillatingField):
-        return None
+    return _add_field(term, state, load, tally, 1.0)
 
-    def add_oscillating_field(term, state, load, tally):
-        return _add_field(term, state, load, tally, cos(term.frequency * state.time[NOW] + term.phase))
 
-    return add_oscillating_field
+@implements(add_forces, OscillatingField)
+def _add_oscillating_field(term, state, load, tally):
+    return _add_field(term, state, load, tally, cos(term.frequency * state.time[NOW] + term.phase))
 
 
 @kernel
@@ -100,9 +95,8 @@ def _add_field(term, state, load, tally, factor):
             load.force[m, k] += factor * term.charge[kind] * term.field[k]
     for m in range(len(state.rotation)):
         mu, q = term.dipole_body[term.species[m]], state.rotation[m]
-        a = factor * body_component(q, term.field, 0)
-        b = factor * body_component(q, term.field, 1)
-        c = factor * body_component(q, term.field, 2)
+        x, y, z = body_vector(q, term.field)
+        a, b, c = factor * x, factor * y, factor * z
         load.torque_body[m, 0] += mu[1] * c - mu[2] * b
         load.torque_body[m, 1] += mu[2] * a - mu[0] * c
         load.torque_body[m, 2] += mu[0] * b - mu[1] * a

@@ -31,21 +31,16 @@ def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> Restr
     index, names = parts.model.species, list(dict.fromkeys(m.name for m in parts.species))
     name = entry.species or names[0]
     of_species = np.array([m.name == name for m in parts.species])[index]
-    if entry.species is None and len(names) > 1:
-        faults.append(f"{where}.species is required: there are {', '.join(names)}")
-    elif name not in names:
-        faults.append(f"{where}.species: there is no {name!r}; there are {', '.join(names)}")
-    elif not of_species.any():
-        faults.append(f"{where}.species: the structure file has no {name}")
-    else:
-        return _restraints(parts, entry, where, faults, name, of_species)
-    return None
-
-
-def _restraints(
-    parts: SystemParts, entry: Any, where: str, faults: list[str], name: str, of_species: np.ndarray
-) -> Restraints | None:
-    moves = parts.moves[parts.model.species]
+    wrong = (
+        f" is required: there are {', '.join(names)}" if entry.species is None and len(names) > 1
+        else f": there is no {name!r}; there are {', '.join(names)}" if name not in names
+        else f": the structure file has no {name}" if not of_species.any()
+        else ""
+    )  # fmt: skip
+    if wrong:
+        faults.append(f"{where}.species{wrong}")
+        return None
+    moves = parts.moves[index]
     restrained = of_species & moves if entry.molecules is None else np.zeros(len(moves), bool)
     for numbers, mask, fault in select_by_number(entry.spans, name, of_species, parts.number):
         if fault:

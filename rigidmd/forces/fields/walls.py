@@ -44,9 +44,12 @@ class LennardJonesWalls(NamedTuple):
         """Components (3,) of the total momentum that they change: the component across them."""
         return np.arange(3) == self.axis
 
-    def behind(self, state: State) -> "SiteBehindWall | None":
-        """The site that is furthest behind a wall, or on it; None if all are in front."""
-        x = _across(self, state)
+    def behind(self, state: State) -> tuple[int, str] | None:
+        """The molecule of the site that is furthest behind a wall, or on it, and where; None if all are in front."""
+        m = self.sites.molecule
+        x = state.position[m, self.axis]  # of the sites
+        if isinstance(self.sites, BodySites):
+            x = x + np.einsum("sj,sj->s", state.rotation[m, self.axis], self.sites.offsets())
         if not len(x):
             return None
         site, depth = max(
@@ -54,8 +57,8 @@ class LennardJonesWalls(NamedTuple):
         )
         if depth < 0:
             return None
-        wall = self.lower if x[site] <= self.lower else self.upper
-        return SiteBehindWall(int(self.sites.molecule[site]), self.axis, float(x[site]), wall)
+        wall, axis = self.lower if x[site] <= self.lower else self.upper, "xyz"[self.axis]
+        return int(m[site]), f"has a site at {axis} = {x[site]:.6g} Å, behind the wall at {axis} = {wall:g} Å"
 
 
 class HarmonicWalls(NamedTuple):
@@ -69,17 +72,6 @@ class HarmonicWalls(NamedTuple):
 
     changes_momentum = LennardJonesWalls.changes_momentum
     tied_to_places = True
-
-
-class SiteBehindWall(NamedTuple):
-    molecule: int
-    axis: int
-    coordinate: float  # of the site, Å
-    wall: float  # Å
-
-    def __str__(self) -> str:
-        axis = "xyz"[self.axis]
-        return f"has a site at {axis} = {self.coordinate:.6g} Å, behind the wall at {axis} = {self.wall:g} Å"
 
 
 def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> LennardJonesWalls | HarmonicWalls:
@@ -99,8 +91,8 @@ def term(parts: SystemParts, walls: Any, where: str, faults: list[str]) -> Lenna
         epsilon, cutoff = walls.epsilon_kJ_mol * KJ_PER_MOL, walls.cutoff_A or inf
         found = LennardJonesWalls(*positions, walls.sigma_A, epsilon, cutoff, sites)
         if (behind := found.behind(parts.state)) is not None:
-            name = parts.species[index[behind.molecule]].name
-            faults.append(f"{where}: at the start, molecule {behind.molecule + 1} ({name}) {behind}")
+            m, reason = behind
+            faults.append(f"{where}: at the start, molecule {m + 1} ({parts.species[index[m]].name}) {reason}")
     if walls is parts.scene.fields.walls[-1]:
         faults += _gap_errors(parts)
     return found
@@ -150,19 +142,9 @@ def _protrusion(walls: Any, parts: SystemParts) -> float:
 def range_of_centres(walls: Any, species: list[Any]) -> tuple[float, float]:
     """Range (lower, upper) of centres of mass that is free for every orientation between walls, Å."""
     points = np.concatenate(_acted_on(walls, species, np.ones(len(species), bool)))
-    margin = float(np.linalg.norm(points, axis=1).max(initial=0.0)) + (
-        WELL * walls.sigma_A if walls.kind == "lj93" else 0.0
-    )
+    margin = float(np.linalg.norm(points, axis=1).max(initial=0.0))
+    margin += WELL * walls.sigma_A if walls.kind == "lj93" else 0.0
     return walls.positions_A[0] + margin, walls.positions_A[1] - margin
-
-
-def _across(walls: LennardJonesWalls, state: State) -> np.ndarray:
-    """Coordinates (s,) of the sites across the walls, Å."""
-    m = walls.sites.molecule
-    x = state.position[m, walls.axis]
-    if isinstance(walls.sites, CentralSites):
-        return x
-    return x + np.einsum("sj,sj->s", state.rotation[m, walls.axis], walls.sites.offsets())
 
 
 @chosen_by_type(inline=True)

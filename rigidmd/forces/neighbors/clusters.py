@@ -302,13 +302,6 @@ def set_local(arguments, block):
                 local[n] = clusters.reference[n]
 
 
-@kernel(count_references=False)
-def use_present_as_reference(clusters):
-    """Use the present positions as references: a skin may be smaller than the rounding between the two."""
-    for n in range(len(clusters.local)):
-        clusters.reference[n] = clusters.local[n]
-
-
 @task(count_references=False)
 def measure_displacements(arguments, block):
     """Set `moved`, and `largest_displacement` of a block, infinite if a displacement exceeds half the skin."""

@@ -67,7 +67,7 @@ class PairList(NamedTuple):
     beyond: np.ndarray  # (rows, SHELLS) uint8 number of entries at the end of a row that are beyond shell k
     entries: np.ndarray  # (blocks, capacity) uint16
     masked_end: np.ndarray  # (rows,) int32 end of each row in masked[b]
-    masked: np.ndarray  # (blocks, capacity, 2) int32 entry, and the lanes that interact with each site, as bits
+    masked: np.ndarray  # (blocks, capacity, 2) int32 entry; lanes that interact with each site, MASK_BITS bits each
     neighbor_end: np.ndarray  # (clusters,) int32
     neighbors: np.ndarray  # (blocks, capacity) int32
     origin_vector: np.ndarray  # (blocks, 3 capacity) to the origin of c from a neighbour, Å; (blocks, 0) in float64
@@ -260,15 +260,3 @@ def end_of_row(pairs, r, displacement):
     moved = max(pairs.clusters.moved[2 * r], pairs.clusters.moved[2 * r + 1])
     shell = min(SHELLS - 1, ceil((moved + displacement) * pairs.shells_per_A))
     return pairs.row_end[r] - pairs.beyond[r, shell]
-
-
-@kernel(inline=True)
-def lanes_of_first(bits):
-    """The lanes of a masked entry that interact with the first site of the row, as bits."""
-    return bits & ((1 << MASK_BITS) - 1)
-
-
-@kernel(inline=True)
-def lanes_of_second(bits):
-    """The lanes of a masked entry that interact with the second site of the row, as bits."""
-    return bits >> MASK_BITS

@@ -23,12 +23,11 @@ from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.neighbors import lists
 from rigidmd.forces.neighbors.lists import (
-    BUILDS, STATUS, USABLE, WINDOW, PairList, behind_block, cluster_of, empty_list, end_of_row, image_number,
-    lanes_of_first, lanes_of_second, largest_displacement, most_needed,
+    BUILDS, MASK_BITS, STATUS, USABLE, WINDOW, PairList, behind_block, cluster_of, empty_list, end_of_row, image_number,
+    largest_displacement, most_needed,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, InSlots, add_offset_virial_of_block, blocks_of, load_block, to_molecular_virial,
-    virial_buffer,
+    BodySites, CentralSites, InSlots, load_from_blocks, load_tasks, virial_buffer,
 )  # fmt: skip
 from rigidmd.forces.neighbors.update import list_code, refill, update_list
 from rigidmd.forces.terms import Setup
@@ -102,19 +101,18 @@ class PairWorkspace(NamedTuple):
         return InSlots(self.sums.forces, self.pairs.clusters.slot)
 
     def with_code(self) -> "PairWorkspace":
-        state, load = EXAMPLE
-        list_tasks = list_code(self.pairs, self.sites)
-        content = (self.slot_potential, self.pairs, self.sums)
-        whole = (list_tasks, self.potential, self.slot_potential, self.sites, self.pairs, self.sums, state)
-        pressed = {} if self.with_energies is None else {"forces_and_virial": (_forces_and_virial, content)}
-        code = Code(
-            update=(_update_pairs, whole), forces=(_forces, content),
-            forces_and_energies=(_forces_and_energies, content),
-            gather=(_gather, content), gather_with_virial=(_gather_with_virial, content),
-            load=(load_block, (self.sites, state, load, self.forces_in_slots)),
-            offset_virial=(add_offset_virial_of_block, (self.sites, state, self.forces_in_slots, self.sums.virial)),
-            **pressed,
-        )  # fmt: skip
+        list_tasks, pairs, sums = list_code(self.pairs, self.sites), self.pairs, self.sums
+        content, tallies = (self.slot_potential, pairs, sums), sums.tallies
+        tasks = {
+            "update": (_update_pairs, (list_tasks, self.potential, *content, self.sites, EXAMPLE[0])),
+            "forces": (_sum_forces, (*content, None, None)),
+            "forces_and_energies": (_sum_forces, (*content, tallies, tallies)),
+            "gather": (_gather_forces, (pairs, sums, None)),
+            "gather_with_virial": (_gather_forces, (pairs, sums, tallies)),
+        }  # fmt: skip
+        if self.with_energies is not None:
+            tasks["forces_and_virial"] = (_sum_forces, (*content, tallies, None))
+        code = Code(**tasks, **load_tasks(self.sites, self.forces_in_slots, sums.virial))
         return self._replace(code=code, list_code=list_tasks)
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
@@ -162,67 +160,53 @@ def pair(potential, i, j, r2):
 
 
 @chosen_by_type
-def arrange(potential, slot_potential, order):
+def arrange(slot_potential, potential, order):
     """Write the numbers of the site in each slot into `slot_potential`; `order` has the site in each slot. Potentials
     with other numbers of sites than a charge implement it."""
     if "charge" in slot_potential.fields:
 
-        def arrange_charges(potential, slot_potential, order):
+        def arrange_charges(slot_potential, potential, order):
             for slot, i in enumerate(order):
                 slot_potential.charge[slot] = potential.charge[i]
 
         return arrange_charges
     if any(isinstance(of, types.Array) for of in slot_potential.types):
         return None
-    return lambda potential, slot_potential, order: None
+    return lambda slot_potential, potential, order: None
 
 
 @implements(terms.add_forces, PairWorkspace, count_references=False)
 def _add_pair_forces(term, state, load, tally):
-    code, pairs, sums = term.code, term.pairs, term.sums
-    everything = (term.list_code, term.potential, term.slot_potential, term.sites, pairs, sums, state)
+    code, potential, pairs, sums = term.code, term.slot_potential, term.pairs, term.sums
+    everything = (term.list_code, term.potential, potential, pairs, sums, term.sites, state)
     call(code, "update", pack_arguments(everything))
     if pairs.counters[STATUS] != OK:
         return pairs.counters[STATUS]
-    arguments = pack_arguments((term.slot_potential, pairs, sums))
     blocks = len(sums.tallies)
     if tally is None:
-        call_blocks(code, "forces", arguments, blocks)
-        call_blocks(code, "gather", arguments, blocks)
+        call_blocks(code, "forces", pack_arguments((potential, pairs, sums, None, None)), blocks)
+        call_blocks(code, "gather", pack_arguments((pairs, sums, None)), blocks)
     else:
-        _call_tallied(term.with_energies, code, arguments, blocks)
-        call_blocks(code, "gather_with_virial", arguments, blocks)
-    force = InSlots(sums.forces, pairs.clusters.slot)
-    call_blocks(code, "load", pack_arguments((term.sites, state, load, force)), blocks_of(len(state.position)))
-    if tally is not None:
-        for block in range(blocks):
-            for k in range(len(tally)):
-                tally[k] += sums.tallies[block, k]
-        to_molecular_virial(term.sites, code, state, force, sums.virial, tally)
+        _call_tallied(term.with_energies, code, (potential, pairs, sums, sums.tallies), blocks)
+        call_blocks(code, "gather_with_virial", pack_arguments((pairs, sums, sums.tallies)), blocks)
+    load_from_blocks(term.sites, code, state, load, InSlots(sums.forces, pairs.clusters.slot), sums, tally)
     return OK
 
 
-@chosen_by_type
-def _call_tallied(with_energies, code, arguments, blocks):
+@kernel
+def _call_tallied(with_energies, code, content, blocks):
     """Call the task that also computes virials, and energies if they are needed."""
-    if with_energies is types.none:
-        return lambda with_energies, code, arguments, blocks: call_blocks(
-            code, "forces_and_energies", arguments, blocks
-        )
-
-    def call_tallied(with_energies, code, arguments, blocks):
-        if with_energies[0] != 0:
-            call_blocks(code, "forces_and_energies", arguments, blocks)
-        else:
-            call_blocks(code, "forces_and_virial", arguments, blocks)
-
-    return call_tallied
+    potential, pairs, sums, tallies = content
+    if with_energies is not None and with_energies[0] == 0:
+        call_blocks(code, "forces_and_virial", pack_arguments((potential, pairs, sums, tallies, None)), blocks)
+        return
+    call_blocks(code, "forces_and_energies", pack_arguments((potential, pairs, sums, tallies, tallies)), blocks)
 
 
 @task()
 def _update_pairs(arguments, block):
     """Update the list, and the numbers of the potential in slots; a status code into counters[STATUS]."""
-    code, potential, slot_potential, sites, pairs, sums, state = load_arguments(arguments)
+    code, potential, slot_potential, pairs, sums, sites, state = load_arguments(arguments)
     builds = pairs.counters[BUILDS]
     status = update_list(pairs, code, sites, state)
     if pairs.counters[BUILDS] != builds:
@@ -233,7 +217,7 @@ def _update_pairs(arguments, block):
 @kernel
 def _arrange_potential(potential, slot_potential, pairs, sums):
     """Put the numbers of the potential into the slots of a new list; a status code."""
-    arrange(potential, slot_potential, pairs.clusters.order)
+    arrange(slot_potential, potential, pairs.clusters.order)
     if 3 * lanes_of(sums.forces_behind) * most_needed(pairs, WINDOW) > sums.forces_behind.shape[1]:
         pairs.counters[USABLE] = 0
         return LIST_FULL
@@ -252,33 +236,15 @@ def _refill(term):
 
 
 @task(count_references=False)
-def _forces(arguments, block):
-    potential, pairs, sums = load_arguments(arguments)
-    block_forces(potential, pairs, sums, None, None, block)
+def _sum_forces(arguments, block):
+    potential, pairs, sums, tallies, energies = load_arguments(arguments)
+    block_forces(potential, pairs, sums, tallies, energies, block)
 
 
 @task(count_references=False)
-def _forces_and_energies(arguments, block):
-    potential, pairs, sums = load_arguments(arguments)
-    block_forces(potential, pairs, sums, sums.tallies, sums.tallies, block)
-
-
-@task(count_references=False)
-def _forces_and_virial(arguments, block):
-    potential, pairs, sums = load_arguments(arguments)
-    block_forces(potential, pairs, sums, sums.tallies, None, block)
-
-
-@task(count_references=False)
-def _gather(arguments, block):
-    _, pairs, sums = load_arguments(arguments)
-    gather_block(pairs, sums.forces, sums.forces_behind, None, block)
-
-
-@task(count_references=False)
-def _gather_with_virial(arguments, block):
-    _, pairs, sums = load_arguments(arguments)
-    gather_block(pairs, sums.forces, sums.forces_behind, sums.tallies, block)
+def _gather_forces(arguments, block):
+    pairs, sums, tallies = load_arguments(arguments)
+    gather_block(pairs, sums.forces, sums.forces_behind, tallies, block)
 
 
 @kernel(inline=True, count_references=False)
@@ -320,7 +286,7 @@ def block_forces(potential, pairs, into, tallies, energies, block):
                 other, image, between = _displacements(pairs, c, here, neighbors, origin_vector, masked[n, 0])
                 if tallies is not None:
                     number = _change_image(pairs, number, image_number(image), sums, force_at_change, tallies[block])
-                masks = (lanes_of_first(masked[n, 1]), lanes_of_second(masked[n, 1]))
+                masks = (masked[n, 1] & ((1 << MASK_BITS) - 1), masked[n, 1] >> MASK_BITS)
                 sums = _interact(potential, pairs, bounds, i, other, between, masks, forces, behind, sums, energies)
             # Displacements are computed one entry ahead: otherwise instructions that wait for them fill the queues of
             # the processor before instructions of the next entry can enter.
@@ -394,30 +360,24 @@ def _displacements(pairs, c, here, neighbors, origin_vector, number):
 
 
 @chosen_by_type(inline=True)
-def load_origin_vector(pairs, c, neighbors, origin_vector, number):
+def load_origin_vector(pairs, c, neighbors, vectors, number):
     """Vector from the origin of a neighbour to the origin of cluster c, Å. In single precision it is stored: to compute
     it would take a sixth of the time of all pairs."""
-    if origin_vector.dtype.bitwidth == 32:
+    if vectors.dtype.bitwidth == 32:
 
-        def stored(pairs, c, neighbors, origin_vector, number):
-            return (
-                load_broadcast(origin_vector, 3 * number),
-                load_broadcast(origin_vector, 3 * number + 1),
-                load_broadcast(origin_vector, 3 * number + 2),
-            )
+        def stored(pairs, c, neighbors, vectors, number):
+            at = 3 * number
+            return load_broadcast(vectors, at), load_broadcast(vectors, at + 1), load_broadcast(vectors, at + 2)
 
         return stored
 
-    def computed(pairs, c, neighbors, origin_vector, number):
+    def computed(pairs, c, neighbors, vectors, number):
         origin, image = pairs.clusters.origin, load_scalar(neighbors, number)
         there = load_four(pairs.shift, 4 * image_number(image)) + load_four(origin, 4 * cluster_of(image))
         vector = load_four(origin, 4 * c) - there
+        x, y, z = extract_lane(vector, 0), extract_lane(vector, 1), extract_lane(vector, 2)
         local = pairs.clusters.local
-        return (
-            broadcast(extract_lane(vector, 0), local),
-            broadcast(extract_lane(vector, 1), local),
-            broadcast(extract_lane(vector, 2), local),
-        )
+        return broadcast(x, local), broadcast(y, local), broadcast(z, local)
 
     return computed
 
@@ -458,16 +418,6 @@ def _interact(potential, pairs, bounds, i, other, between, masks, forces, forces
 
 
 @kernel(inline=True)
-def _with_product(virial, force, at):
-    """A symmetric virial, six vectors, with force (x) position added."""
-    x, y, z = force
-    return (
-        virial[0] + x * at[0], virial[1] + x * at[1], virial[2] + x * at[2],
-        virial[3] + y * at[1], virial[4] + y * at[2], virial[5] + z * at[2],
-    )  # fmt: skip
-
-
-@kernel(inline=True)
 def _masked_pair(potential, i, j, r2, mask):
     """Force over distance on a site from each of a vector of others, and the energies; 0 where there is none."""
     counts = r2 < potential.cutoff * potential.cutoff
@@ -495,12 +445,14 @@ def gather_block(pairs, forces, forces_behind, tallies, block):
             store(forces, at + k * width, convert_to(force[k], forces))
         if tallies is not None:
             local = clusters.local
-            there = (
-                to_double(load(local, at)) + (origin[4 * c] - origin[middle]),
-                to_double(load(local, at + width)) + (origin[4 * c + 1] - origin[middle + 1]),
-                to_double(load(local, at + 2 * width)) + (origin[4 * c + 2] - origin[middle + 2]),
-            )
-            virial = _with_product(virial, force, there)
+            x = to_double(load(local, at)) + (origin[4 * c] - origin[middle])
+            y = to_double(load(local, at + width)) + (origin[4 * c + 1] - origin[middle + 1])
+            z = to_double(load(local, at + 2 * width)) + (origin[4 * c + 2] - origin[middle + 2])
+            fx, fy, fz = force
+            virial = (
+                virial[0] + fx * x, virial[1] + fx * y, virial[2] + fx * z,
+                virial[3] + fy * y, virial[4] + fy * z, virial[5] + fz * z,
+            )  # fmt: skip
     if tallies is not None:
         xx, xy, xz, yy, yz, zz = virial
         _add_symmetric_virial(

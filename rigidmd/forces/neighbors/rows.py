@@ -8,8 +8,8 @@ import numpy as np
 
 from rigidmd.compile import kernel, load_arguments, task
 from rigidmd.compile.simd import (
-    broadcast, lanes_of, load, load_broadcast, load_scalar, load_with_lanes_of, mask_bits, maximum, minimum,
-    pairwise_minimum, square_root, store_even_lanes,
+    broadcast, lanes_of, load, load_broadcast, load_scalar, load_with_lanes_of, mask_bits, pairwise_minimum,
+    square_root, store_even_lanes,
 )  # fmt: skip
 from rigidmd.forces.neighbors.lists import (
     ENTRIES, IMAGES, IMAGES_FOUND, MASK_BITS, MASKED, MAX_BEYOND, NEIGHBORS, NEIGHBORS_OF_ONE, ROUNDING, SHELLS, WINDOW,
@@ -35,24 +35,26 @@ class Scratch(NamedTuple):
     filled: np.ndarray  # (5,) of the block so far, see PairList.needed
 
 
-@kernel
-def _new_scratch(pairs, capacity):
-    rows = lanes_of(pairs.clusters.local) // 2
-    return Scratch(
-        np.empty((len(pairs.tree.level), 2), np.int64), np.empty(3), np.empty(3), np.empty(capacity, np.int64),
-        np.empty(capacity + lanes_of(pairs.tree.low), np.int64), np.empty(capacity, np.int64),
-        np.empty(rows * (capacity + 1), np.uint8), np.empty((rows, KINDS), np.uint32),
-        np.empty((rows, capacity), np.uint16), np.zeros(5, np.int64),
-    )  # fmt: skip
+@task()
+def fill_rows(arguments, block):
+    """Fill the rows of one block."""
+    pairs = load_arguments(arguments)
+    capacity = 256
+    while capacity > 0:
+        capacity = _fill_block(pairs, block, capacity)
 
 
 @kernel(inline=True)
-def fill_block(pairs, block, capacity):
+def _fill_block(pairs, block, capacity):
     """Fill the rows of one block. Entries beyond the capacity are counted but not stored. Returns 0, or the capacity
     needed for candidates if it is too small; the rows are then incomplete."""
     clusters = pairs.clusters
-    scratch = _new_scratch(pairs, capacity)
-    arity = lanes_of(pairs.tree.low)
+    arity, rows = lanes_of(pairs.tree.low), lanes_of(clusters.local) // 2
+    scratch = Scratch(
+        np.empty((len(pairs.tree.level), 2), np.int64), np.empty(3), np.empty(3), np.empty(capacity, np.int64),
+        np.empty(capacity + arity, np.int64), np.empty(capacity, np.int64), np.empty(rows * (capacity + 1), np.uint8),
+        np.empty((rows, KINDS), np.uint32), np.empty((rows, capacity), np.uint16), np.zeros(5, np.int64),
+    )  # fmt: skip
     end = clusters.bounds[block + 1]
     for first in range(clusters.bounds[block], end, arity):
         last = min(first + arity, end)
@@ -131,7 +133,7 @@ def _find_candidates(pairs, c, scratch, families):
 def _fill_rows(pairs, block, c, scratch, candidates):
     width = lanes_of(pairs.clusters.local)
     rows = width // 2
-    masked, filled = pairs.masked[block], scratch.filled
+    entries, masked, filled = pairs.entries[block], pairs.masked[block], scratch.filled
     radius2 = _reach(pairs) ** 2
     count = _find_kinds(pairs, c, scratch, candidates)
     _store_neighbors(pairs, block, c, scratch, count)
@@ -139,8 +141,12 @@ def _fill_rows(pairs, block, c, scratch, candidates):
     for row in range(rows):
         r = rows * c + row
         here = scratch.sorted[row]
-        _write_row(pairs.entries[block], here, scratch.kind_end[row, SHELLS - 1], filled)
-        pairs.row_end[r] = min(filled[ENTRIES], pairs.entries.shape[1])
+        begin, size = filled[ENTRIES], scratch.kind_end[row, SHELLS - 1]
+        filled[ENTRIES] += size
+        if filled[ENTRIES] <= len(entries):
+            for n in range(size):
+                entries[begin + n] = here[n]
+        pairs.row_end[r] = min(filled[ENTRIES], len(entries))
         for n in range(scratch.kind_end[row, OUT_OF_REACH], scratch.kind_end[row, NEEDS_MASK]):
             entry = np.int64(here[n])
             first_of_row = _mask_of_lanes(pairs, 2 * r, scratch.candidate[entry], radius2)
@@ -207,16 +213,6 @@ def _begin_kinds(beyond, kind_end):
 
 
 @kernel(inline=True)
-def _write_row(entries, found, count, filled):
-    """Append the first `count` found to the entries, if the capacity suffices."""
-    first = filled[ENTRIES]
-    filled[ENTRIES] += count
-    if filled[ENTRIES] <= len(entries):
-        for n in range(count):
-            entries[first + n] = found[n]
-
-
-@kernel(inline=True)
 def _find_kinds(pairs, c, scratch, candidates):
     """Reduce the candidates to those that a row of the cluster needs, and find their kinds; returns their number. There
     are no unpredictable branches, so the processor works on several candidates at a time."""
@@ -255,15 +251,15 @@ def _find_kinds_of_candidate(pairs, c, kind, candidate, at):
     # is subtracted. Two minima are independent of each other, which is faster.
     one, two = broadcast(inf, reference), broadcast(inf, reference)
     for lane in range(0, width, 2):
-        one = minimum(one, _half_square_less_product(clusters, other, lane, x, y, z))
-        two = minimum(two, _half_square_less_product(clusters, other, lane + 1, x, y, z))
-    nearest2 = 2.0 * minimum(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
+        one = min(one, _half_square_less_product(clusters, other, lane, x, y, z))
+        two = min(two, _half_square_less_product(clusters, other, lane + 1, x, y, z))
+    nearest2 = 2.0 * min(one, two) + (x * x + y * y + z * z) * (1 - 0.1 * ROUNDING)
     kinds = broadcast(0.0, reference)
     if pairs.cutoff < inf:
-        distance = square_root(maximum(pairwise_minimum(nearest2), 0.0))
+        distance = square_root(max(pairwise_minimum(nearest2), 0.0))
         scale = pairs.shells_per_A
         shell = distance * (scale * (1 - ROUNDING)) + (1 - pairs.cutoff * scale)  # 1 to 2 in the first beyond
-        kinds = minimum(maximum(shell, 0.0), float(OUT_OF_REACH))
+        kinds = min(max(shell, 0.0), float(OUT_OF_REACH))
     store_even_lanes(kind, at, kinds)
     return mask_bits(kinds < float(OUT_OF_REACH)) != 0, mask_bits(nearest2 <= pairs.reach2) != 0
 

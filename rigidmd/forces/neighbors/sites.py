@@ -14,6 +14,7 @@ from rigidmd.compile import (
 )  # fmt: skip
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
 from rigidmd.core.state import EXAMPLE
+from rigidmd.mechanics.translation import body_vector, lab_vector
 
 # Up to this number, loops over molecules run on one thread: they take a few microseconds.
 SERIAL_MOLECULES = 128
@@ -31,12 +32,6 @@ def molecules_of_block(molecules, block, together):
     """First and end of the molecules of a block: whole groups of `together` molecules, except the last."""
     blocks, groups = blocks_of(molecules), (molecules + together - 1) // together
     return together * (groups * block // blocks), min(molecules, together * (groups * (block + 1) // blocks))
-
-
-@kernel(inline=True)
-def _molecules_of(state, block):
-    n, blocks = len(state.position), blocks_of(len(state.position))
-    return range(n * block // blocks, n * (block + 1) // blocks)
 
 
 class BodySites(NamedTuple):
@@ -116,13 +111,9 @@ def site_vector(vectors, i):
         return lambda vectors, i: (vectors[i, 0], vectors[i, 1], vectors[i, 2])
 
     def from_slot(vectors, i):
-        width = lanes_of(vectors.value)
+        value, width = vectors.value, lanes_of(vectors.value)
         at = index_of_x(load_scalar(vectors.slot, i), width)
-        return (
-            load_scalar(vectors.value, at),
-            load_scalar(vectors.value, at + width),
-            load_scalar(vectors.value, at + 2 * width),
-        )
+        return load_scalar(value, at), load_scalar(value, at + width), load_scalar(value, at + 2 * width)
 
     return from_slot
 
@@ -158,11 +149,8 @@ def predict_site(sites, state, m, i, lead):
         row = sites.kind[m] - sites.first[m] + i
         offset, inverse = sites.offset_body[row], sites.inverse_inertia[row]
         # Cayley rotation by 2 atan(|a|) about a = lead omega / 2, which keeps distances within a molecule
-        a, b, c = (
-            0.5 * lead * inverse[0] * momentum[0],
-            0.5 * lead * inverse[1] * momentum[1],
-            0.5 * lead * inverse[2] * momentum[2],
-        )
+        half = 0.5 * lead
+        a, b, c = half * inverse[0] * momentum[0], half * inverse[1] * momentum[1], half * inverse[2] * momentum[2]
         x, y, z = offset[0], offset[1], offset[2]
         factor = 2 / (1 + a * a + b * b + c * c)
         u, v, w = factor * (b * z - c * y), factor * (c * x - a * z), factor * (a * y - b * x)
@@ -180,14 +168,8 @@ def predict_site(sites, state, m, i, lead):
 def site_offset_lab(sites, state, m, i):
     """Vector (x, y, z) from the centre of mass of molecule m to its site i, lab frame, Å."""
     m = np.uint64(m)
-    q = state.rotation[m]
     offset = sites.offset_body[np.uint64(sites.kind[m] - sites.first[m] + i)]
-    x, y, z = offset[0], offset[1], offset[2]
-    return (
-        q[0, 0] * x + q[0, 1] * y + q[0, 2] * z,
-        q[1, 0] * x + q[1, 1] * y + q[1, 2] * z,
-        q[2, 0] * x + q[2, 1] * y + q[2, 2] * z,
-    )
+    return lab_vector(state.rotation[m], offset[0], offset[1], offset[2])
 
 
 @chosen_by_type(inline=True)
@@ -213,9 +195,7 @@ def load_molecule(sites, state, load, m, site_force):
             fx, fy, fz = site_vector(site_force, i)
             sum_x, sum_y, sum_z = sum_x + fx, sum_y + fy, sum_z + fz
             # n_body = d x (Q^T f), with the site's offset d in the body frame
-            bx = q[0, 0] * fx + q[1, 0] * fy + q[2, 0] * fz
-            by = q[0, 1] * fx + q[1, 1] * fy + q[2, 1] * fz
-            bz = q[0, 2] * fx + q[1, 2] * fy + q[2, 2] * fz
+            bx, by, bz = body_vector(q, (fx, fy, fz))
             offset = sites.offset_body[np.uint64(begin + i)]
             x, y, z = offset[0], offset[1], offset[2]
             turn_x += y * bz - z * by
@@ -231,99 +211,90 @@ def load_molecule(sites, state, load, m, site_force):
     return load_body
 
 
-@kernel(inline=True)
-def compute_molecule_positions(sites, state, m, site_position):
-    """Write the positions of the sites of molecule m into site_position (s, 3), lab frame."""
-    for i in range(sites.first[m], sites.first[m + 1]):
-        site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
-
-
 @kernel(from_python=True)
 def compute_site_positions(sites, state, site_position):
     """Write the positions of all sites into site_position (s, 3), lab frame; molecules are not wrapped."""
     for m in range(len(state.position)):
-        compute_molecule_positions(sites, state, m, site_position)
-
-
-@kernel
-def load_from_sites(sites, state, load, site_force):
-    """Add site forces, an array (s, 3) or `InSlots`, to the bodies' forces and torques."""
-    for m in range(len(state.position)):
-        load_molecule(sites, state, load, m, site_force)
+        for i in range(sites.first[m], sites.first[m + 1]):
+            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
 
 
 @task()
-def compute_positions_of_block(arguments, block):
+def _compute_positions_of_block(arguments, block):
     """`compute_site_positions` for the molecules of a block, see `blocks_of`."""
     sites, state, site_position = load_arguments(arguments)
-    for m in _molecules_of(state, block):
-        compute_molecule_positions(sites, state, m, site_position)
+    first, end = molecules_of_block(len(state.position), block, 1)
+    for m in range(first, end):
+        for i in range(sites.first[m], sites.first[m + 1]):
+            site_position[i, 0], site_position[i, 1], site_position[i, 2] = locate_site(sites, state, m, i)
 
 
 @task()
-def load_block(arguments, block):
-    """`load_from_sites` for the molecules of a block, see `blocks_of`."""
+def _load_block(arguments, block):
+    """`load_molecule` for the molecules of a block, see `blocks_of`."""
     sites, state, load, site_force = load_arguments(arguments)
-    for m in _molecules_of(state, block):
+    first, end = molecules_of_block(len(state.position), block, 1)
+    for m in range(first, end):
         load_molecule(sites, state, load, m, site_force)
 
 
 @task()
-def add_offset_virial_of_block(arguments, block):
+def _sum_offset_virial_of_block(arguments, block):
     """Sums of f (x) (x_site - X_molecule) over the molecules of a block (`blocks_of`), into a row (9,) of `virial`."""
     sites, state, site_force, virial = load_arguments(arguments)
-    block_virial = virial[block]
-    block_virial[:] = 0.0
-    for m in _molecules_of(state, block):
-        _add_offset_virial(sites, state, m, site_force, block_virial)
-
-
-def site_tasks(sites: BodySites | CentralSites, position: np.ndarray, force: np.ndarray, virial: np.ndarray) -> dict:
-    """The tasks "positions", "load" and "offset_virial" of a `Code`, for positions and forces (s, 3)."""
-    state, load = EXAMPLE
-    return {
-        "positions": (compute_positions_of_block, (sites, state, position)),
-        "load": (load_block, (sites, state, load, force)),
-        "offset_virial": (add_offset_virial_of_block, (sites, state, force, virial)),
-    }
-
-
-def virial_buffer() -> np.ndarray:
-    """Array for the sums of `add_offset_virial_of_block`: 9 for each block, which has two cache lines."""
-    return np.zeros((MOST_BLOCKS, 16))
-
-
-@chosen_by_type
-def to_molecular_virial(sites, code, state, site_force, virial, tally):
-    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule).
-
-    code : with the task "offset_virial". virial : of `virial_buffer`
-    """
-    if is_a(sites, CentralSites):
-        return lambda sites, code, state, site_force, virial, tally: None
-
-    def to_molecular_virial(sites, code, state, site_force, virial, tally):
-        blocks = blocks_of(len(state.position))
-        call_blocks(code, "offset_virial", pack_arguments((sites, state, site_force, virial)), blocks)
-        for block in range(blocks):
-            for k in range(9):
-                tally[1 + k] -= virial[block, k]
-
-    return to_molecular_virial
-
-
-@chosen_by_type(inline=True)
-def _add_offset_virial(sites, state, m, site_force, virial):
-    """Add f (x) (x_site - X_molecule) of the sites of a molecule to nine numbers."""
-    if is_a(sites, CentralSites):
-        return lambda sites, state, m, site_force, virial: None
-
-    def add_offset_virial(sites, state, m, site_force, virial):
+    virial[block] = 0.0
+    first, end = molecules_of_block(len(state.position), block, 1)
+    for m in range(first, end):
         for i in range(sites.first[m], sites.first[m + 1]):
             offset = site_offset_lab(sites, state, m, i)
             force = site_vector(site_force, i)
             for row in range(3):
                 for k in range(3):
-                    virial[3 * row + k] += force[row] * offset[k]
+                    virial[block, 3 * row + k] += force[row] * offset[k]
 
-    return add_offset_virial
+
+def position_task(sites: BodySites | CentralSites, position: np.ndarray) -> dict:
+    """The task "positions" of a `Code`: `compute_site_positions` into an array (s, 3)."""
+    return {"positions": (_compute_positions_of_block, (sites, EXAMPLE[0], position))}
+
+
+def load_tasks(sites: BodySites | CentralSites, force: np.ndarray | InSlots, virial: np.ndarray) -> dict:
+    """The tasks "load" and "offset_virial" of a `Code`, for `load_from_blocks`."""
+    state, load = EXAMPLE
+    tasks = {"load": (_load_block, (sites, state, load, force))}
+    if isinstance(sites, BodySites):
+        tasks["offset_virial"] = (_sum_offset_virial_of_block, (sites, state, force, virial))
+    return tasks
+
+
+def virial_buffer() -> np.ndarray:
+    """Array for the sums of `_sum_offset_virial_of_block`: 9 for each block, which has two cache lines."""
+    return np.zeros((MOST_BLOCKS, 16))
+
+
+@kernel(count_references=False)
+def load_from_blocks(sites, code, state, load, site_force, sums, tally):
+    """`load_molecule` for all molecules, on all threads; with a tally, also the sum of `sums.tallies` (blocks, 10), as
+    energy and molecular virial. code : with `load_tasks`. sums : also has `virial`, of `virial_buffer`"""
+    blocks = blocks_of(len(state.position))
+    call_blocks(code, "load", pack_arguments((sites, state, load, site_force)), blocks)
+    if tally is not None:
+        for block in range(len(sums.tallies)):
+            for k in range(len(tally)):
+                tally[k] += sums.tallies[block, k]
+        _subtract_offset_virial(sites, code, state, site_force, sums.virial, tally, blocks)
+
+
+@chosen_by_type
+def _subtract_offset_virial(sites, code, state, site_force, virial, tally, blocks):
+    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
+    if is_a(sites, CentralSites):
+        return lambda sites, code, state, site_force, virial, tally, blocks: None
+
+    def subtract_offset_virial(sites, code, state, site_force, virial, tally, blocks):
+        call_blocks(code, "offset_virial", pack_arguments((sites, state, site_force, virial)), blocks)
+        for block in range(blocks):
+            for k in range(9):
+                tally[1 + k] -= virial[block, k]
+
+    return subtract_offset_virial

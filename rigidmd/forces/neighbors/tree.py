@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import kernel, load_arguments, task
-from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bits, maximum
+from rigidmd.compile.simd import lane_count, lanes_of, load, lowest_bit, mask_bits
 
 
 class BoxTree(NamedTuple):
@@ -94,9 +94,9 @@ def families_within_reach(tree, low, high, radius2, first, end, clusters, stack,
 @kernel(inline=True)
 def near(tree, node, low, high, radius2):
     """Which of the boxes from a node on, as many as its siblings, are closer than a radius to a box, as bits."""
-    dx = maximum(maximum(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
-    dy = maximum(maximum(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
-    dz = maximum(maximum(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
+    dx = max(max(load(tree.low[0], node) - high[0], low[0] - load(tree.high[0], node)), 0.0)
+    dy = max(max(load(tree.low[1], node) - high[1], low[1] - load(tree.high[1], node)), 0.0)
+    dz = max(max(load(tree.low[2], node) - high[2], low[2] - load(tree.high[2], node)), 0.0)
     return mask_bits(dx * dx + dy * dy + dz * dz < radius2)
 
 

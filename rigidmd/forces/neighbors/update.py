@@ -7,16 +7,17 @@ from rigidmd.compile import Code, call, call_blocks, kernel, load_arguments, pac
 from rigidmd.core.state import CELL_CHANGED, EXAMPLE, LIST_FULL, NOT_FINITE, NOW, OK
 from rigidmd.forces.neighbors.clusters import (
     BUILT, LEAD_TIME, bin_sites, measure_displacements, restore_half_squares, set_local, set_origins,
-    sort_into_clusters, use_present_as_reference, wrap_sites,
+    sort_into_clusters, wrap_sites,
 )  # fmt: skip
 from rigidmd.forces.neighbors.lists import (
     BUILDS, ENTRIES, IMAGES_FOUND, LONGEST_SKIN, MASKED, MAX_NEIGHBORS, NEIGHBORS, NEIGHBORS_OF_ONE, STATUS, USABLE,
     PairList, largest_displacement, most_needed,
 )  # fmt: skip
-from rigidmd.forces.neighbors.rows import fill_block, update_origin_vectors
+from rigidmd.forces.neighbors.rows import fill_rows, update_origin_vectors
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
+from rigidmd.forces.terms import copy
 
 #: A list is built for positions predicted ahead by this fraction of the lifetime of the last list: sites first approach
 #: these. The list is valid for longer by a fifth (water) or a half (nitrogen). With a larger fraction the sites are
@@ -31,7 +32,7 @@ def list_code(pairs: PairList, sites: BodySites | CentralSites) -> Code:
         origin_vectors=(update_origin_vectors, pairs), local=(set_local, site_arguments),
         displacements=(measure_displacements, pairs), wrap=(wrap_sites, site_arguments),
         bin=(bin_sites, site_arguments), sort=(_sort_sites, pairs), origins=(set_origins, site_arguments),
-        boxes=(fit_boxes, pairs), fill=(_fill, pairs),
+        boxes=(fit_boxes, pairs), fill=(fill_rows, pairs),
     )  # fmt: skip
 
 
@@ -42,9 +43,10 @@ def update_list(pairs, code, sites, state):
     arguments = pack_arguments(pairs)
     site_arguments = pack_arguments((pairs, sites, state))
     if follow_cell(state.cell, pairs.cell):
-        if not _has_no_nan(pairs.cell):
-            pairs.counters[USABLE] = 0
-            return NOT_FINITE
+        for k in range(9):
+            if pairs.cell[k // 3, k % 3] != pairs.cell[k // 3, k % 3]:  # NaN, which comparisons do not detect
+                pairs.counters[USABLE] = 0
+                return NOT_FINITE
         if pairs.counters[USABLE] == 1:
             if _move_images(pairs):
                 call_blocks(code, "origin_vectors", arguments, blocks)
@@ -70,7 +72,8 @@ def update_list(pairs, code, sites, state):
             call_blocks(code, "origins", site_arguments, blocks)
             call_blocks(code, "local", site_arguments, blocks)
             if ahead == 0.0:
-                use_present_as_reference(pairs.clusters)
+                # the present positions: a skin may be smaller than their rounding
+                copy(pairs.clusters.local, pairs.clusters.reference)
             call_blocks(code, "displacements", arguments, blocks)
             if largest_displacement(pairs) < inf:
                 break
@@ -108,16 +111,6 @@ def _finish_build(pairs):
     pairs.counters[USABLE] = 1
     pairs.counters[BUILDS] += 1
     return OK
-
-
-@kernel
-def _has_no_nan(cell):
-    """Whether no component of a cell is NaN, which comparisons and extremes do not detect."""
-    for vector in range(3):
-        for k in range(3):
-            if cell[vector, k] != cell[vector, k]:
-                return False
-    return True
 
 
 @kernel(inline=True)
@@ -180,9 +173,7 @@ def _find_images(pairs):
     stacked in layers along c and in rows along b. The radius is not longer than any edge, so there are 27 images in an
     orthorhombic box and up to 48 in a triclinic one."""
     cell, multiple = pairs.cell, pairs.multiple
-    for vector in range(3):
-        for k in range(3):
-            pairs.built[vector, k] = cell[vector, k]
+    copy(cell, pairs.built)
     pairs.slack[0] = 0.0
     radius = min(pairs.cutoff + pairs.skin + _max_slack(pairs), _shortest(cell))  # rounding may exceed it
     multiple[0, 0] = multiple[0, 1] = multiple[0, 2] = 0
@@ -212,11 +203,3 @@ def _images_along(cell, k, offset, radius):
     if edge == inf:
         return 0, 0
     return floor((-radius - offset) / edge), ceil((edge + radius - offset) / edge) - 1
-
-
-@task()
-def _fill(arguments, block):
-    pairs = load_arguments(arguments)
-    capacity = 256
-    while capacity > 0:
-        capacity = fill_block(pairs, block, capacity)

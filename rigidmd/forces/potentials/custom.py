@@ -8,7 +8,7 @@ vectors that the pair loop reads from a table.
 # isort: skip_file
 from collections.abc import Callable
 from math import inf, pi
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
@@ -68,15 +68,13 @@ def energy_and_force_at(formula, shared, r2, inverse1, inverse2):
     raise TypeError(f"{type(formula).__name__} is not a formula, or this was called outside compiled code")
 
 
-def uses_root(formula: Any, truncation: Any) -> bool:
-    """Whether a potential needs 1/r besides 1/r², by the Numba types of its formula and truncation."""
-    return not is_a(truncation, Unmodified) or getattr(formula.instance_class, "uses_root", True)
+@implements(pairs.pair, CustomOneKind, inline=True)
+def _pair_of_one_kind(potential, i, j, r2):
+    return energy_and_force(potential, potential.formula, potential.terms, r2)
 
 
 @implements(pairs.pair, inline=True)
 def _pair(potential, i, j, r2):
-    if is_a(potential, CustomOneKind):
-        return lambda potential, i, j, r2: energy_and_force(potential, potential.formula, potential.terms, r2)
     if not is_a(potential, CustomManyKinds):
         return None
     types = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
@@ -104,7 +102,7 @@ def _pair(potential, i, j, r2):
 def energy_and_force(potential, formula, terms, r2):
     """(energy, force/r) of a potential with the parameters and the truncation terms of a pair."""
     truncation = potential.types[potential.fields.index("truncation")]
-    if uses_root(formula, truncation):
+    if not is_a(truncation, Unmodified) or getattr(formula.instance_class, "uses_root", True):
 
         def with_root(potential, formula, terms, r2):
             inverse1 = inverse_square_root(r2)
@@ -120,25 +118,19 @@ def energy_and_force(potential, formula, terms, r2):
     return without_root
 
 
-@implements(pairs.arrange)
-def _arrange(potential, slot_potential, order):
-    if not is_a(slot_potential, CustomManyKinds):
-        return None
-
-    def arrange(potential, slot_potential, order):
-        slots = len(order)
-        for slot, i in enumerate(order):
-            kind = potential.kind[i]
-            slot_potential.kind[slot] = kind
-            for k in range(len(potential.interacts)):
-                at = k * slots + slot
-                slot_potential.table[at] = potential.interacts[k, kind]
-                for e in range(4):
-                    slot_potential.table[at + (1 + e) * slot_potential.stride] = potential.terms_of_kinds[e, k, kind]
-                for p in range(len(potential.parameters)):
-                    slot_potential.table[at + (5 + p) * slot_potential.stride] = potential.parameters[p, k, kind]
-
-    return arrange
+@implements(pairs.arrange, CustomManyKinds)
+def _arrange(slot_potential, potential, order):
+    table, stride = slot_potential.table, slot_potential.stride
+    for slot, i in enumerate(order):
+        kind = potential.kind[i]
+        slot_potential.kind[slot] = kind
+        for k in range(len(potential.interacts)):
+            at = k * len(order) + slot
+            table[at] = potential.interacts[k, kind]
+            for e in range(4):
+                table[at + (1 + e) * stride] = potential.terms_of_kinds[e, k, kind]
+            for p in range(len(potential.parameters)):
+                table[at + (5 + p) * stride] = potential.parameters[p, k, kind]
 
 
 def tail_of_pair(radial: Callable[[float], tuple], terms: np.ndarray, truncation: Truncation) -> tuple[float, float]:

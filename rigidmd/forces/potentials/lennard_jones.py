@@ -36,21 +36,13 @@ class LennardJones(NamedTuple):
     def for_slots(self, slots: int, dtype: type) -> "LennardJonesOneKind | LennardJonesManyKinds":
         """What the pair loop reads: numbers if all sites are of one kind, else a table for all slots."""
         head, kinds = self[:4], len(self.c12)
-        if kinds == 1:
-            c12, c6 = float(self.c12[0, 0]), float(self.c6[0, 0])
-            if found := switch_correction_of(self.truncation, {12: c12, 6: -c6}, dtype):
-                return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found)
-            return LennardJonesOneKind(*head, c12, c6, *_switch_terms(self.truncation, c12, c6, dtype), NO_SWITCH)
-        table = zeros((2, kinds * slots), dtype)
-        return LennardJonesManyKinds(
-            *head, np.zeros(slots, np.int32), *table, *_switch_terms(self.truncation, 1.0, 1.0, dtype)
-        )
-
-
-def _switch_terms(
-    truncation: Truncation, c12: float, c6: float, dtype: type
-) -> tuple[SwitchTerm | tuple[()], SwitchTerm | tuple[()]]:
-    return switch_term_of(truncation, {12: c12}, dtype), switch_term_of(truncation, {6: c6}, dtype)
+        c12, c6 = (float(self.c12[0, 0]), float(self.c6[0, 0])) if kinds == 1 else (1.0, 1.0)
+        addends = [switch_term_of(self.truncation, {power: c}, dtype) for power, c in ((12, c12), (6, c6))]
+        if kinds > 1:
+            return LennardJonesManyKinds(*head, np.zeros(slots, np.int32), *zeros((2, kinds * slots), dtype), *addends)
+        if found := switch_correction_of(self.truncation, {12: c12, 6: -c6}, dtype):
+            return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found)
+        return LennardJonesOneKind(*head, c12, c6, *addends, NO_SWITCH)
 
 
 class LennardJonesOneKind(NamedTuple):
@@ -172,18 +164,15 @@ def _inverse_power(p: int):
     return lambda r: (r**-p, p * r ** -(p + 1), -p * (p + 1) * r ** -(p + 2))
 
 
-@implements(pairs.pair, inline=True)
+@implements(pairs.pair, LennardJonesOneKind, inline=True)
+def _pair_of_one_kind(potential, i, j, r2):
+    return energy_and_force(potential, potential.c12, potential.c6, r2)
+
+
+@implements(pairs.pair, LennardJonesManyKinds, inline=True)
 def _pair(potential, i, j, r2):
-    if is_a(potential, LennardJonesOneKind):
-        return lambda potential, i, j, r2: energy_and_force(potential, potential.c12, potential.c6, r2)
-    if not is_a(potential, LennardJonesManyKinds):
-        return None
-
-    def pair(potential, i, j, r2):
-        at = potential.kind[i] * len(potential.kind) + j
-        return energy_and_force(potential, load(potential.c12, at), load(potential.c6, at), r2)
-
-    return pair
+    at = potential.kind[i] * len(potential.kind) + j
+    return energy_and_force(potential, load(potential.c12, at), load(potential.c6, at), r2)
 
 
 @chosen_by_type(inline=True)
@@ -245,19 +234,13 @@ def mixed(terms12, terms6, c12, c6):
     )  # fmt: skip
 
 
-@implements(pairs.arrange)
-def _arrange(potential, slot_potential, order):
-    if not is_a(slot_potential, LennardJonesManyKinds):
-        return None
-
-    def arrange(potential, slot_potential, order):
-        for slot, i in enumerate(order):
-            slot_potential.kind[slot] = potential.kind[i]
-            for k in range(len(potential.c12)):
-                slot_potential.c12[k * len(order) + slot] = potential.c12[k, potential.kind[i]]
-                slot_potential.c6[k * len(order) + slot] = potential.c6[k, potential.kind[i]]
-
-    return arrange
+@implements(pairs.arrange, LennardJonesManyKinds)
+def _arrange(slot_potential, potential, order):
+    for slot, i in enumerate(order):
+        slot_potential.kind[slot] = potential.kind[i]
+        for k in range(len(potential.c12)):
+            slot_potential.c12[k * len(order) + slot] = potential.c12[k, potential.kind[i]]
+            slot_potential.c6[k * len(order) + slot] = potential.c6[k, potential.kind[i]]
 
 
 def tail(potential: LennardJones) -> Tail:

@@ -248,27 +248,20 @@ def _coefficient(table, term, k):
     return permute_two(load(table, INTERVALS * term), load(table, INTERVALS * term + 16), k)
 
 
-@implements(pairs.pair, inline=True)
-def _pair(potential, i, j, r2):
-    if is_a(potential, ScreenedCoulomb):
+@implements(pairs.pair, ScreenedCoulomb, inline=True)
+def _screened_pair(potential, i, j, r2):
+    qq = potential.charge[i] * load(potential.charge, j)
+    inverse, one, two = inverse_root_and_cube(r2)
+    u, w = screened(potential.screening, inverse, (one, two), r2)
+    return qq * (u - potential.shift), qq * w
 
-        def ewald_pair(potential, i, j, r2):
-            qq = potential.charge[i] * load(potential.charge, j)
-            inverse, one, two = inverse_root_and_cube(r2)
-            u, w = screened(potential.screening, inverse, (one, two), r2)
-            return qq * (u - potential.shift), qq * w
 
-        return ewald_pair
-    if not is_a(potential, DampedShiftedForce):
-        return None
-
-    def shifted_pair(potential, i, j, r2):
-        qq = potential.charge[i] * load(potential.charge, j)
-        inverse = inverse_square_root(r2)
-        u, w = screened(potential.screening, inverse, (inverse, inverse * inverse), r2)
-        return qq * (u + potential.slope * (r2 * inverse) + potential.shift), qq * (w - potential.slope * inverse)
-
-    return shifted_pair
+@implements(pairs.pair, DampedShiftedForce, inline=True)
+def _shifted_pair(potential, i, j, r2):
+    qq = potential.charge[i] * load(potential.charge, j)
+    inverse = inverse_square_root(r2)
+    u, w = screened(potential.screening, inverse, (inverse, inverse * inverse), r2)
+    return qq * (u + potential.slope * (r2 * inverse) + potential.shift), qq * (w - potential.slope * inverse)
 
 
 def damped_self_energy(potential: DampedShiftedForce, position: np.ndarray) -> float:

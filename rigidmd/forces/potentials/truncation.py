@@ -29,7 +29,7 @@ from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.compile.simd import inverse_square_root, maximum, polynomial
+from rigidmd.compile.simd import inverse_square_root, polynomial
 
 TruncationName = Literal["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"]
 TRUNCATIONS: tuple[str, ...] = get_args(TruncationName)
@@ -166,11 +166,12 @@ def switch_term(truncation, switched, r):
     """A `SwitchTerm` at distances r; 0 below the start, and for anything else."""
     if not is_a(switched, SwitchTerm):
         return lambda truncation, switched, r: 0.0
-    power = squared if is_a(truncation, Switched) else to_the_fourth
+    is_quintic = is_a(truncation, Switched)
 
     def switch_term(truncation, switched, r):
         t = switch_coordinate(truncation, r)
-        return power(t) * polynomial(switched.coefficients, t)
+        square = t * t
+        return (square if is_quintic else square * square) * polynomial(switched.coefficients, t)
 
     return switch_term
 
@@ -183,26 +184,16 @@ def correction(truncation, switched, r2):
 
     def correction(truncation, switched, r2):
         first, last = truncation.start * truncation.start, truncation.cutoff * truncation.cutoff
-        x = maximum(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
-        return squared(x + 1.0) * polynomial(switched.coefficients, x)
+        x = max(r2 * (2 / (last - first)) - (last + first) / (last - first), -1.0)
+        return (x + 1.0) * (x + 1.0) * polynomial(switched.coefficients, x)
 
     return correction
 
 
 @kernel(inline=True, from_python=True)
-def squared(x):
-    return x * x
-
-
-@kernel(inline=True, from_python=True)
-def to_the_fourth(x):
-    return x * x * (x * x)
-
-
-@kernel(inline=True, from_python=True)
 def switch_coordinate(truncation, r):
     """t of a switch: 0 up to the start, 1 at the cutoff."""
-    return maximum((r - truncation.start) * (1 / (truncation.cutoff - truncation.start)), 0.0)
+    return max((r - truncation.start) * (1 / (truncation.cutoff - truncation.start)), 0.0)
 
 
 def needs_root(truncation, switched) -> bool:
@@ -220,7 +211,7 @@ def truncated(truncation, terms, switched, r2, inverse, u, w):
     if is_a(truncation, ForceShifted):
 
         def bent(truncation, terms, switched, r2, inverse, u, w):
-            du, df = truncation_polynomial(terms, maximum(r2 * inverse - truncation.start, 0.0))
+            du, df = truncation_polynomial(terms, max(r2 * inverse - truncation.start, 0.0))
             return u + du, w + df * inverse
 
         return bent

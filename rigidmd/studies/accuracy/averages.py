@@ -14,7 +14,7 @@ import numpy as np
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
-from rigidmd.dynamics.momenta import remove_momentum
+from rigidmd.dynamics.model import remove_momentum
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.run.observers import Every
