@@ -1,10 +1,9 @@
 """`rigidmd accuracy`: errors of integrators against their run time; with --averages alone, the bias of averages."""
 
-import argparse
 from math import inf
 from pathlib import Path
 
-from rigidmd.commands.arguments import SCENE, argument, command, command_line, output_folder, read_scene, write_study
+from rigidmd.commands.arguments import SCENE, Options, argument, command, output_folder, read_scene, write_study
 
 
 @command(
@@ -32,7 +31,7 @@ from rigidmd.commands.arguments import SCENE, argument, command, command_line, o
         help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)"),
     *output_folder("runs/NAME-accuracy"), writes=True,
 )  # fmt: skip
-def _accuracy(options: argparse.Namespace) -> int:
+def _accuracy(options: Options) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.studies.accuracy import averages_report, report
     from rigidmd.studies.accuracy.accuracy import measure_accuracy
@@ -51,7 +50,7 @@ def _accuracy(options: argparse.Namespace) -> int:
             folder, options.force, averages_report.FILES, "compiling, and running what comes before the last stage",
             lambda progress: measure_averages(scene, integrators, timesteps, sample, progress),
             lambda found: [averages_report.table_text(found), "", *averages_report.bias_conclusions(found)],
-            lambda folder, found: averages_report.write_averages(folder, found, command_line()),
+            averages_report.write_averages,
         )  # fmt: skip
         return 0
     if options.sample_ps is not None:
@@ -61,6 +60,6 @@ def _accuracy(options: argparse.Namespace) -> int:
         folder, options.force, report.FILES, "compiling and running the reference",
         lambda progress: measure_accuracy(scene, *settings, progress),
         lambda found: [*report.recommendations(found), "", report.table_text(found)],
-        lambda folder, found: report.write_accuracy(folder, found, command_line()),
+        report.write_accuracy,
     )  # fmt: skip
     return 0

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import argument, command, number, time_ps
+from rigidmd.commands.arguments import Options, argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
 
@@ -31,7 +31,7 @@ class _List(argparse.Action):
     argument("--list", action=_List, nargs=0, help="list the analyses"),
     scene="this run", writes=True,
 )  # fmt: skip
-def _analyse(options: argparse.Namespace) -> int:
+def _analyse(options: Options) -> int:
     from rigidmd.analysis.files import AnalysisRequest, analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.studies.sweep.folder import is_sweep

@@ -14,6 +14,7 @@ from rigidmd.engines.registry import engine_options, runnable
 
 #: Adds an argument to the parser of a command.
 Argument = Callable[[argparse.ArgumentParser], object]
+Options = argparse.Namespace
 
 
 class Command(NamedTuple):
@@ -22,7 +23,7 @@ class Command(NamedTuple):
     example: str
     arguments: tuple[Argument, ...]
     options: dict[str, Any]  # that no argument sets
-    call: Callable[[argparse.Namespace], int]
+    call: Callable[[Options], int]
 
 
 COMMANDS: dict[str, Command] = {}  # the commands of the imported modules, by name
@@ -36,7 +37,7 @@ def command(position: int, about: str, example: str, *arguments: Argument, **opt
     The function is called with the options, and returns the exit code.
     """
 
-    def register(call: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    def register(call: Callable[[Options], int]) -> Callable[[Options], int]:
         COMMANDS[call.__name__.strip("_")] = Command(position, about, example, arguments, options, call)
         return call
 
@@ -117,7 +118,7 @@ def add_engine(parser: argparse.ArgumentParser, default: str = "the scene's", it
         parser.add_argument(f"--{key}", type=kind, metavar=metavar, help=text)
 
 
-def read_scene(options: argparse.Namespace, **more):
+def read_scene(options: Options, **more):
     """The scene of the options of `SCENE` and `add_engine`; more : further keys to override."""
     from rigidmd.scene import Scene, parse_override
 
@@ -145,7 +146,7 @@ def run_folder(output: str) -> tuple[Argument, Argument, Argument]:
     )
 
 
-def file_about_run(options: argparse.Namespace, default: str, extensions: tuple[str, ...]) -> Path:
+def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) -> Path:
     """The file to write. By default it is in the folder of the run, where it may be replaced; a new run removes it.
     Raises OutputError."""
     from rigidmd.io.folder import add_to_folder, check_is_run
@@ -166,7 +167,7 @@ def command_line() -> str:
 
 def write_study(
     folder: Path, force: bool, files: tuple[str, ...], begins: str, measure: Callable[[Callable], Any],
-    describe: Callable[[Any], list[str]], write: Callable[[Path, Any], list[Path]],
+    describe: Callable[[Any], list[str]], write: Callable[[Path, Any, str], list[Path]],
 ) -> Any:  # fmt: skip
     """Measure something, print it and write its files into a folder, which is locked meanwhile. Returns what was found.
 
@@ -180,7 +181,7 @@ def write_study(
             found = measure(progress)
         print(*describe(found), sep="\n")
         make_folder(folder, files, lock)
-        written = write(folder, found)
+        written = write(folder, found, command_line())
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return found
 

@@ -1,13 +1,11 @@
 """`rigidmd check`."""
 
-import argparse
-
-from rigidmd.commands.arguments import SCENE, add_engine, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, add_engine, command, read_scene
 from rigidmd.commands.streams import warn
 
 
 @command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine)
-def _check(options: argparse.Namespace) -> int:
+def _check(options: Options) -> int:
     from rigidmd.assemble.describe import describe
     from rigidmd.run.pilot.stable_step import step_warnings
     from rigidmd.scene import BodyScene, MolecularScene

@@ -1,11 +1,10 @@
 """`rigidmd compare`."""
 
-import argparse
 import json
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import argument, command
+from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
@@ -16,7 +15,7 @@ from rigidmd.commands.arguments import argument, command
     argument("second", metavar="RUN", help="folder of another run"),
     argument("--json", action="store_true", help="print JSON"),
 )  # fmt: skip
-def _compare(options: argparse.Namespace) -> int:
+def _compare(options: Options) -> int:
     from rigidmd.studies.compare import compare, describe_run_comparison
 
     found = compare(Path(options.first), Path(options.second))

@@ -1,10 +1,9 @@
 """`rigidmd energy`."""
 
-import argparse
 import json
 from typing import Any
 
-from rigidmd.commands.arguments import SCENE, argument, command, read_scene
+from rigidmd.commands.arguments import SCENE, Options, argument, command, read_scene
 
 
 @command(
@@ -14,7 +13,7 @@ from rigidmd.commands.arguments import SCENE, argument, command, read_scene
     argument("--accuracy", action="store_true",
         help="also measure the error of the Coulomb forces (Ewald sums and PME)"),
 )  # fmt: skip
-def _energy(options: argparse.Namespace) -> int:
+def _energy(options: Options) -> int:
     from rigidmd.run import Simulation
     from rigidmd.scene import BodyScene
     from rigidmd.units import ENERGY_UNITS
@@ -60,7 +59,7 @@ def _print_accuracy(error: dict[str, Any], unit: str) -> None:
     _print_value("error of the energy", error["energy_error"], unit, ">22.4g")
 
 
-def _body_energy(scene, options: argparse.Namespace) -> int:
+def _body_energy(scene, options: Options) -> int:
     from rigidmd.errors import SceneError
     from rigidmd.run import Simulation
 

@@ -1,12 +1,10 @@
 """`rigidmd examples`."""
 
-import argparse
-
-from rigidmd.commands.arguments import command
+from rigidmd.commands.arguments import Options, command
 
 
 @command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
-def _examples(options: argparse.Namespace) -> int:
+def _examples(options: Options) -> int:
     from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples, examples_in
 
     scenes = examples()

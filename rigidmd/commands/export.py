@@ -1,10 +1,9 @@
 """`rigidmd export`."""
 
-import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import SCENE, command, output_folder, read_scene
+from rigidmd.commands.arguments import SCENE, Options, command, output_folder, read_scene
 from rigidmd.engines.registry import programs
 
 
@@ -16,7 +15,7 @@ from rigidmd.engines.registry import programs
     ),
     *output_folder("NAME-ENGINE", "an earlier export"), writes=True,
 )  # fmt: skip
-def _export(options: argparse.Namespace) -> int:
+def _export(options: Options) -> int:
     from rigidmd.studies.other_engines import export
 
     scene = read_scene(options)

@@ -1,9 +1,8 @@
 """`rigidmd film`."""
 
-import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import argument, command, file_about_run, number, run_folder
+from rigidmd.commands.arguments import Options, argument, command, file_about_run, number, run_folder
 from rigidmd.commands.streams import progress_bar
 
 
@@ -17,7 +16,7 @@ from rigidmd.commands.streams import progress_bar
     argument("--plots", action="store_true", help="put plots with a moving cursor next to it"),
     scene="this run", writes=True,
 )  # fmt: skip
-def _film(options: argparse.Namespace) -> int:
+def _film(options: Options) -> int:
     from rigidmd.view.animation import EXTENSIONS, check_writer, default_name, write_film
 
     path = file_about_run(options, default_name(), EXTENSIONS)

@@ -1,10 +1,9 @@
 """`rigidmd gallery`."""
 
-import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import argument, command, print_page
+from rigidmd.commands.arguments import Options, argument, command, print_page
 from rigidmd.commands.streams import announce
 
 
@@ -16,7 +15,7 @@ from rigidmd.commands.streams import announce
     argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
     scene="the gallery", writes=True,
 )  # fmt: skip
-def _gallery(options: argparse.Namespace) -> int:
+def _gallery(options: Options) -> int:
     from rigidmd.io.write import check_target
     from rigidmd.view.run_page import INDEX, selected_bodies, write_gallery
 

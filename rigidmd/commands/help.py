@@ -1,15 +1,13 @@
 """`rigidmd help`."""
 
-import argparse
-
-from rigidmd.commands.arguments import argument, command
+from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
     190, "list the chapters of the documentation, or print one", "rigidmd help water | less",
     argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them"),
 )  # fmt: skip
-def _help(options: argparse.Namespace) -> int:
+def _help(options: Options) -> int:
     from rigidmd.core.shipped import chapter_text, contents
 
     if options.chapter is not None:

@@ -1,10 +1,9 @@
 """`rigidmd models`."""
 
-import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import argument, command
+from rigidmd.commands.arguments import Options, argument, command
 from rigidmd.commands.streams import warn
 from rigidmd.errors import MoleculeError
 
@@ -23,7 +22,7 @@ from rigidmd.errors import MoleculeError
         help="picture file: .png, .svg or .pdf; with --from the file of the model (default: the structure's, .toml)"),
     argument("--force", action="store_true", help="replace that file"),
 )  # fmt: skip
-def _models(options: argparse.Namespace) -> int:
+def _models(options: Options) -> int:
     from rigidmd.scene.models import available_models, load_model, read_molecule
     from rigidmd.view.molecule_figure import models_table, molecule_text
 
@@ -51,7 +50,7 @@ def _models(options: argparse.Namespace) -> int:
     return 0
 
 
-def _write_model(options: argparse.Namespace) -> int:
+def _write_model(options: Options) -> int:
     """`models --from`."""
     from rigidmd.assemble.species import model_from_geometry
     from rigidmd.io.scene_file import write_model

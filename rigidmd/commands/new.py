@@ -1,10 +1,9 @@
 """`rigidmd new`."""
 
-import argparse
 import shlex
 from pathlib import Path
 
-from rigidmd.commands.arguments import argument, command
+from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
@@ -13,7 +12,7 @@ from rigidmd.commands.arguments import argument, command
     argument("-o", "--output", metavar="FILE", help="the copy (default: NAME.toml, .ipynb or .py)"),
     argument("--force", action="store_true", help="replace that file"),
 )  # fmt: skip
-def _new(options: argparse.Namespace) -> int:
+def _new(options: Options) -> int:
     from rigidmd.core.shipped import copy_example, find_example, series_of
     from rigidmd.scene import Scene
 

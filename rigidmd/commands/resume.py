@@ -1,9 +1,8 @@
 """`rigidmd resume`."""
 
-import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import TRUST, argument, command
+from rigidmd.commands.arguments import TRUST, Options, argument, command
 from rigidmd.commands.run import DURATION, run
 
 
@@ -12,7 +11,7 @@ from rigidmd.commands.run import DURATION, run
     argument("folder", metavar="DIR", help="folder of the run"), TRUST, *DURATION,
     overrides=[], force=False, resume=True, writes=True,
 )  # fmt: skip
-def _resume(options: argparse.Namespace) -> int:
+def _resume(options: Options) -> int:
     from rigidmd.io.folder import SCENE, check_is_run
 
     folder = Path(options.folder)

@@ -1,11 +1,10 @@
 """`rigidmd run`; `resume` uses its options and its call."""
 
-import argparse
 import shlex
 from pathlib import Path
 
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
-from rigidmd.commands.arguments import SCENE, add_engine, argument, command, read_scene, seconds, time_ps
+from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
@@ -27,7 +26,7 @@ DURATION = (
         help="continue from the last checkpoint in that folder, with bitwise identical results; without one, start"),
     add_engine, *DURATION, writes=True,
 )  # fmt: skip
-def run(options: argparse.Namespace) -> int:
+def run(options: Options) -> int:
     from rigidmd.scene import BodyScene
 
     scene = read_scene(options)

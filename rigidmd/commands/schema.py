@@ -1,13 +1,12 @@
 """`rigidmd schema`."""
 
-import argparse
 import json
 
-from rigidmd.commands.arguments import command
+from rigidmd.commands.arguments import Options, command
 
 
 @command(180, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json")
-def _schema(options: argparse.Namespace) -> int:
+def _schema(options: Options) -> int:
     from rigidmd.scene import schema
 
     print(json.dumps(schema(), indent=2, allow_nan=False))

@@ -1,10 +1,9 @@
 """`rigidmd stability`."""
 
-import argparse
 from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import argument, command, command_line, output_folder, write_study
+from rigidmd.commands.arguments import Options, argument, command, output_folder, write_study
 
 
 @command(
@@ -15,7 +14,7 @@ from rigidmd.commands.arguments import argument, command, command_line, output_f
     argument("--case", action="append", metavar="NAME", help="only this case; may be repeated"),
     *output_folder("runs/stability"), scene="stability", writes=True,
 )  # fmt: skip
-def _stability(options: argparse.Namespace) -> int:
+def _stability(options: Options) -> int:
     import platform
 
     from rigidmd.studies.stability.report import FILES, conclusions, has_failed, run_cases, table_text, write_stability
@@ -25,6 +24,6 @@ def _stability(options: argparse.Namespace) -> int:
     results = write_study(
         folder, options.force, FILES, "", lambda progress: list(run_cases(options.case, options.quick, progress)),
         lambda results: [table_text(results), "", *conclusions(results)],
-        lambda folder, results: write_stability(folder, results, command_line(), machine),
+        lambda folder, results, command: write_stability(folder, results, command, machine),
     )  # fmt: skip
     return FAILED if has_failed(results) else 0

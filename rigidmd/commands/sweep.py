@@ -1,6 +1,5 @@
 """`rigidmd sweep`."""
 
-import argparse
 import os
 import shlex
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigidmd.commands import BY_SIGNAL, FAILED, INTERRUPTED, OUT_OF_TIME
-from rigidmd.commands.arguments import TRUST, argument, command, number, output_folder, seconds
+from rigidmd.commands.arguments import TRUST, Options, argument, command, number, output_folder, seconds
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import OutputError, visible
 
@@ -46,7 +45,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         help="run point K of an existing sweep, counted from 0"),
     TRUST, overrides=[], writes=True,
 )  # fmt: skip
-def _sweep(options: argparse.Namespace) -> int:
+def _sweep(options: Options) -> int:
     from contextlib import ExitStack
 
     from rigidmd.studies.sweep.plan import parse_axes
@@ -75,7 +74,7 @@ def _sweep(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check(options: argparse.Namespace) -> None:
+def _check(options: Options) -> None:
     """Raise OutputError for options that cannot be combined."""
     if options.to is not None and options.walltime is None:
         raise OutputError("--to slurm needs --walltime, the time of each job: --walltime 4:00:00")
@@ -90,7 +89,7 @@ def _check(options: argparse.Namespace) -> None:
         raise OutputError("--collect only reads existing results; leave out --force, which removes them")
 
 
-def _run(options: argparse.Namespace, sweep: "OpenSweep") -> int:
+def _run(options: Options, sweep: "OpenSweep") -> int:
     from rigidmd.io.progress import progress_of
     from rigidmd.studies.sweep.backends import Cluster, Pool
     from rigidmd.studies.sweep.sweeping import SweepOutcome, jobs_and_threads, run_points
@@ -180,7 +179,7 @@ def _collect(sweep: "OpenSweep") -> int:
     return FAILED if sweep.left else 0
 
 
-def _run_point(options: argparse.Namespace) -> int:
+def _run_point(options: Options) -> int:
     """`--point`: the point that a scheduler started."""
     if options.threads is not None:
         os.environ["NUMBA_NUM_THREADS"] = str(options.threads)  # before Numba is imported

@@ -1,9 +1,8 @@
 """`rigidmd report` and `rigidmd view`."""
 
-import argparse
 from pathlib import Path
 
-from rigidmd.commands.arguments import command, file_about_run, print_page, run_folder
+from rigidmd.commands.arguments import Options, command, file_about_run, print_page, run_folder
 
 
 @command(
@@ -11,7 +10,7 @@ from rigidmd.commands.arguments import command, file_about_run, print_page, run_
     "rigidmd report runs/water",
     *run_folder("page (default: report.html in the folder of the run)"), scene="this run", writes=True,
 )  # fmt: skip
-def _report(options: argparse.Namespace) -> int:
+def _report(options: Options) -> int:
     from rigidmd.view.run_page import REPORT, write_report
 
     print_page(*write_report(Path(options.folder), file_about_run(options, REPORT, (".html",))))
@@ -23,7 +22,7 @@ def _report(options: argparse.Namespace) -> int:
     "rigidmd view runs/water -o water.html",
     *run_folder("page (default: view.html in the folder of the run)"), scene="this run", writes=True,
 )  # fmt: skip
-def _view(options: argparse.Namespace) -> int:
+def _view(options: Options) -> int:
     from rigidmd.view.run_page import VIEW, write_view
 
     print_page(*write_view(Path(options.folder), file_about_run(options, VIEW, (".html",))))
