@@ -23,6 +23,9 @@ class Column(NamedTuple):
     about: str
 
 
+UNBIASED = "without the error of the step (velocity Verlet only)"
+
+
 class Sample(NamedTuple):
     """One line of the log, in its units. NaN for what does not exist: pressure without a box, T_rot of points."""
 
@@ -37,12 +40,8 @@ class Sample(NamedTuple):
     stage_name: Annotated[str, Column("Stage", "", "name of the stage")]
     temperature_translation: Annotated[float, Column("T_trans (K)", "K", "temperature of translation")]
     temperature_rotation: Annotated[float, Column("T_rot (K)", "K", "temperature of rotation")]
-    temperature_translation_unbiased: Annotated[
-        float, Column("T_trans unbiased (K)", "K", "T_trans without the error of the step (velocity Verlet only)")
-    ]
-    temperature_rotation_unbiased: Annotated[
-        float, Column("T_rot unbiased (K)", "K", "T_rot without the error of the step (velocity Verlet only)")
-    ]
+    temperature_translation_unbiased: Annotated[float, Column("T_trans unbiased (K)", "K", f"T_trans {UNBIASED}")]
+    temperature_rotation_unbiased: Annotated[float, Column("T_rot unbiased (K)", "K", f"T_rot {UNBIASED}")]
     pressure_bar: Annotated[float, Column("Pressure (bar)", "bar", "molecular pressure, tail correction included")]
     drift: Annotated[float, Column("Drift (kJ/mole)", "kJ/mol", "change of `conserved` since the stage began")]
     momentum: Annotated[float, Column("Momentum (u A/ps)", "u Å/ps", "size of the total momentum")]

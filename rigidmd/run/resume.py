@@ -6,7 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -219,8 +219,7 @@ class RunRecord:
     @classmethod
     def types(cls) -> dict[str, Any]:
         """Field -> its type."""
-        hints = get_type_hints(cls, include_extras=True)
-        return {each.name: hints[each.name] for each in fields(cls)}
+        return get_type_hints(cls, include_extras=True)
 
 
 @contextlib.contextmanager

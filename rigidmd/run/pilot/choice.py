@@ -235,8 +235,7 @@ def choose(
             f"; {least.integrator} reaches {getattr(least, error):.1e} at {least.timestep:.3g} {system.time_unit}"
         )  # fmt: skip
         raise SimulationError(f"no integrator keeps its error below {target:g} with any step tried{reached}")
-    best = first
-    per = "ps" if system.time_unit == "fs" else "s"
+    best, per = first, "ps" if system.time_unit == "fs" else "s"
     value, over, words = getattr(best, error), f"over {system.span:.3g} {per}", ""
     if duration is not None and duration > system.span:
         best, value, words = _best_for_duration(search, best, duration)
