@@ -25,7 +25,7 @@ class Program(NamedTuple):
 
     title: str
     install: str  # how to install it
-    translations: str  # its `engines.translations.Translations`
+    translations: str  # its `engines.external.Translations`
     engine: str = ""  # its subclass of `engines.external.ExternalEngine`; empty if it cannot be run
     installed: str = ""  # a function that describes what is installed here
     options: Mapping[str, Option] = {}
