@@ -152,7 +152,7 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
     """What is not compiled for this scene, and why."""
-    forces, has_images = scene.forces, "coulomb_reciprocal" in terms
+    forces, has_images, removal = scene.forces, "coulomb_reciprocal" in terms, scene.run.remove_momentum_interval_ps
     method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
     no_charges = "electrostatics is none" if method == "none" else "no site has one"
     reasons = {
@@ -166,9 +166,7 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
         "periodic images: no box": space.volume == inf,
         "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
         "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
-        "removal of the total momentum: run.remove_momentum_interval_ps is false": (
-            scene.run.remove_momentum_interval_ps is False
-        ),
+        "removal of the total momentum: run.remove_momentum_interval_ps is false": removal is False,
         "tail correction: not requested": not forces.tail_correction,
     }  # fmt: skip
     fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]

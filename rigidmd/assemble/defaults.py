@@ -74,9 +74,8 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
         found = of_method(scene.forces, composition, numbers["cutoff_A"])
         faults = found.errors
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
-        faults.append(
-            "output.pressure_tensor_interval_ps needs a periodic box, without which the pressure is not defined"
-        )
+        why = "without which the pressure is not defined"
+        faults.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
     output = scene.output
     if output.velocities is None:
         output = output.model_copy(update={"velocities": output.can_store_velocities})

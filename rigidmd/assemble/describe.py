@@ -76,7 +76,7 @@ def _describe_body(system: BodySystem) -> str:
 
 
 def _describe_molecules(system: System) -> str:
-    scene, freedom = system.scene, system.last_freedom
+    scene, free = system.scene, system.last_freedom
     lines = [f"{scene.name}: {len(system.model.species)} molecules, {system.site_count} sites"]
     for k, m in enumerate(system.species):
         count = int((system.model.species == k).sum())
@@ -85,9 +85,7 @@ def _describe_molecules(system: System) -> str:
     charges = np.array([m.charge for m in system.species])[system.model.species]
     if abs(charges.sum()) > 1e-9 * np.abs(charges).sum():
         lines.append(f"  net charge: {charges.sum():+.6g} e")
-    lines.append(
-        f"  degrees of freedom: {freedom.total} = {freedom.translation} translation + {freedom.rotation} rotation"
-    )
+    lines.append(f"  degrees of freedom: {free.total} = {free.translation} translation + {free.rotation} rotation")
     box = "no box"
     if system.space.volume < inf:
         cell = cell_of(system.space)

@@ -67,10 +67,8 @@ def match(
     runs_by_bonds = _bonded(atoms, kinds, species, cell)
     by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
     if isinstance(by_bonds, MatchedMolecules):
-        if by_residue:
-            by_bonds.notes.append(
-                "its residues are not the molecules of the scene, which were found by bonding distance"
-            )
+        note = "its residues are not the molecules of the scene, which were found by bonding distance"
+        by_bonds.notes.extend([note] if by_residue else [])
         return by_bonds
     if by_residue and len(runs) > 1:
         return by_residue

@@ -46,10 +46,8 @@ def check_memory_of_molecules(source: str, molecules: int, sites: int) -> None:
 def check_memory_of_samples(scene: BodyScene) -> None:
     """Raise SceneError if the samples of a resolved scene of a body exceed the memory."""
     run, interval = scene.run, not_none(scene.output.interval_s)
-    samples = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
-    _require(
-        scene.source, BYTES_PER_SAMPLE * samples, f"a run with {samples:.3g} samples", "lengthen output.interval_s"
-    )
+    count = run.duration_s / (interval if run.is_auto else max(interval, run.timestep_s))
+    _require(scene.source, BYTES_PER_SAMPLE * count, f"a run with {count:.3g} samples", "lengthen output.interval_s")
 
 
 def check_memory(system: "System") -> None:

@@ -111,16 +111,13 @@ def atoms_errors(atoms: Any) -> list[str]:
             faults.append(f"atoms[{np.argmin(fine)}] has a {what} that is not a finite number")
     if atoms.pbc.any() and not atoms.pbc.all():
         axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
-        faults.append(
-            f"they are periodic along {axes} only: set pbc along all three axes or none (a slab can have a long cell)"
-        )
+        advice = "set pbc along all three axes or none (a slab can have a long cell)"
+        faults.append(f"they are periodic along {axes} only: {advice}")
     elif atoms.pbc.all():
         cell = atoms.cell.array
-        fault = cell_error(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
-        if fault:
-            faults.append(
-                f"they are periodic, but their cell is invalid: {fault}. Set atoms.cell, or atoms.pbc = False"
-            )
+        why = cell_error(cell) if np.isfinite(cell).all() else "it has an edge that is not a finite number"
+        if why:
+            faults.append(f"they are periodic, but their cell is invalid: {why}. Set atoms.cell, or atoms.pbc = False")
     return faults
 
 

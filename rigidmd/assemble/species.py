@@ -183,9 +183,8 @@ def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
         formula = "".join(f"{element}{number if number > 1 else ''}" for element, number in sorted(members[0].items()))
         raise StructureError(str(path), [f"has {count} molecules {formula}: keep one"])
     if count > 1:
-        notes.append(
-            f"its atoms are in {count} parts without a bond between them: the model is one rigid body of all of them"
-        )
+        parts = f"{count} parts without a bond between them"
+        notes.append(f"its atoms are in {parts}: the model is one rigid body of all of them")
     return notes
 
 

@@ -36,9 +36,8 @@ def describe_stage(stage: Stage) -> list[str]:
             error = f"{stage.energy_error_kT:g} kT per degree of freedom of the energy, over the stage (rms)"
         elif stage.bias_kT:
             error = f"{stage.bias_kT:g} kT per degree of freedom of the average potential energy"
-        text = (
-            f"{stage.label}: {stage.duration_ps:g} ps, integrator and step chosen at its start for an error of {error}"
-        )
+        choice = f"integrator and step chosen at its start for an error of {error}"
+        text = f"{stage.label}: {stage.duration_ps:g} ps, {choice}"
     if stage.has_thermostat:
         kind, described = stage.thermostat_kind, THERMOSTATS[stage.thermostat_kind].description(stage.thermostat_values)
         text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"

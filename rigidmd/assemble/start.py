@@ -135,11 +135,9 @@ def overlaps(system: "System") -> list[str]:
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
     widest = max((sigma.max() for sigma in cores), default=0.0)
-    near = close_pairs(
-        system, system.state, (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
-    )
+    wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     sigma, faults = gather_per_molecule(cores, system.model.species), []
-    for i, j, distance in near:
+    for i, j, distance in close_pairs(system, system.state, *wanted):
         both = sigma[i] > 0 and sigma[j] > 0
         if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
             a, b = system.sites.molecule[[i, j]]

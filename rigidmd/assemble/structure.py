@@ -226,9 +226,8 @@ def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], n
         return None, None
     without = np.array(np.isnan(atoms.velocity).any(axis=1))
     if lost := sorted(i for run in matched.atoms for i in run[without[run]]):
-        notes.append(
-            f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1}): no velocity is used"
-        )
+        which = f"{len(lost)} of its atoms have no velocity (the first is atom {lost[0] + 1})"
+        notes.append(f"{which}: no velocity is used")
         return None, None
     n = len(matched.species)
     velocity, angular = np.zeros((n, 3)), np.zeros((n, 3))

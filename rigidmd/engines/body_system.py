@@ -63,15 +63,13 @@ class BodySystem:
     @property
     def notes(self) -> list[str]:
         """Notes on a duration or an interval that is not a whole number of steps."""
-        run, found = self.scene.run, []
+        run, dt, found = self.scene.run, self.scene.run.timestep_s, []
         interval = not_none(self.scene.output.interval_s)
         given = interval != run.duration_s / SAMPLES
         for key, wanted in (("run.duration_s", run.duration_s), ("output.interval_s", given and interval)):
-            used = wanted and max(1, round(wanted / run.timestep_s)) * run.timestep_s
+            used = wanted and max(1, round(wanted / dt)) * dt
             if not run.is_auto and wanted and abs(used - wanted) > 1e-9 * wanted:
-                found.append(
-                    f"{key} = {wanted:g} is not a whole number of steps of {run.timestep_s:g} s: {used:g} s is used"
-                )
+                found.append(f"{key} = {wanted:g} is not a whole number of steps of {dt:g} s: {used:g} s is used")
         return found
 
     @property

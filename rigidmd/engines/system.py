@@ -136,10 +136,8 @@ class System:
         """A state as its file holds it, with names and numbers. Frozen and free molecules are one species there."""
         names = list(dict.fromkeys(m.name for m in self.species))
         index = np.array([names.index(m.name) for m in self.species])
-        first = [next(m for m in self.species if m.name == name) for name in names]
-        return SavedState(
-            state, names, index[self.model.species], self.residue_number, np.array([m.fingerprint for m in first])
-        )
+        first = [next(m for m in self.species if m.name == name).fingerprint for name in names]
+        return SavedState(state, names, index[self.model.species], self.residue_number, np.array(first))
 
     @property
     def residue_names(self) -> np.ndarray:
@@ -152,10 +150,9 @@ class System:
     def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> CpuEngine:
         """A new engine for this system with the given terms."""
         scene = self.scene
-        needs_virials = any(stage.ensemble == "nph" for stage in scene.stages)
-        return CpuEngine(
-            self.model, terms, precision, scene.forces.skin_A, self.python_forces, scene.threads, needs_virials
-        )
+        virials = any(stage.ensemble == "nph" for stage in scene.stages)
+        skin = scene.forces.skin_A
+        return CpuEngine(self.model, terms, precision, skin, self.python_forces, scene.threads, virials)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,); `of` returns the values of one molecule."""

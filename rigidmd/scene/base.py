@@ -172,9 +172,8 @@ class Scene(Section, Displayed):
                 overridden.append(key)
         if wrong := impossible_values(data):
             raise SceneError(source, [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong])
-        faults += [
-            f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in numbers_out_of_range(data, *kind.SIZES)
-        ]
+        wrong = numbers_out_of_range(data, *kind.SIZES)
+        faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
         faults += kind.contradictions(data, text)
         whole, rows = with_registered_rows(data)
         scene = None

@@ -197,9 +197,8 @@ class MolecularScene(Scene):
 
     def with_user_code(self, forces: Sequence[Any] = (), thermostat: Any = None) -> "MolecularScene":
         """The same scene with forces and a thermostat from Python, see `Simulation`. Raises SceneError."""
-        user_code = UserCode(
-            (*self._user_code.forces, *forces), thermostat if thermostat is not None else self._user_code.thermostat
-        )
+        thermostat = self._user_code.thermostat if thermostat is None else thermostat
+        user_code = UserCode((*self._user_code.forces, *forces), thermostat)
         if self.from_python not in ((), user_code.names):
             raise SceneError(self.source, [missing_user_code(self.from_python, user_code.names)])
         scene = self.model_copy(update={"from_python": user_code.names})
@@ -225,9 +224,7 @@ class MolecularScene(Scene):
         """Species, their origin and stages."""
         species = ", ".join(f"{entry.count or ''} {entry.label}".strip() for entry in self.molecules)
         origin = "" if self.structure is None else f" of {self.structure.file}"
-        stages = ", ".join(
-            stage.label if stage.is_minimisation else f"{stage.label} {stage.duration:g} ps" for stage in self.stages
-        )
+        stages = ", ".join(s.label if s.is_minimisation else f"{s.label} {s.duration:g} ps" for s in self.stages)
         return f"{self.name}: {species}{origin}; {stages}"
 
     @property

@@ -373,9 +373,8 @@ def read_columns(path: Path) -> Columns:
         values = [float(word) if _is_number(word) else inf for word in words]
         row, expected = dict(zip(names, values, strict=False)), (len(names),) if names is not COLUMNS else (2, 3)
         if len(words) not in ((len(rows[0]),) if rows else expected):
-            faults.append(
-                f"line {number}: has {len(words)} numbers, must have the same columns in all lines: {', '.join(names)}"
-            )
+            must = f"must have the same columns in all lines: {', '.join(names)}"
+            faults.append(f"line {number}: has {len(words)} numbers, {must}")
         elif not all(map(isfinite, values)):
             faults.append(f"line {number}: {' '.join(words):.60} has something else than finite numbers")
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):

@@ -26,9 +26,8 @@ def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
     for path in paths:
         if _source(Path(path), "--trust") not in contents:
             files = f"it names {', '.join(map(str, named))}" if named else "it names none"
-            raise SceneError(
-                "--trust", [f"{path} is not a file that [[forces.custom]] of {scene.source} names by module: {files}"]
-            )
+            what = f"is not a file that [[forces.custom]] of {scene.source} names by module"
+            raise SceneError("--trust", [f"{path} {what}: {files}"])
 
 
 def trusted_module(path: Path, key: str) -> ModuleType:

@@ -222,12 +222,10 @@ def _barostat(view: ForceFieldView, stage: Stage) -> str:
     tail, volume = view.system.tail, view.system.state.volume
     tail_pressure = 0.0 if tail is None else tail.pressure(volume)
     first, last = ([(bar * BAR - tail_pressure) / ATMOSPHERE for bar in at[:3]] for at in stage.pressures)
-    damping = 1e3 * stage.barostat_time
+    damping = _num(1e3 * stage.barostat_time)
     if stage.pressure_coupling == "isotropic":
-        return f"iso {_num(np.mean(first))} {_num(np.mean(last))} {_num(damping)}"
-    axes = " ".join(
-        f"{axis} {_num(a)} {_num(b)} {_num(damping)}" for axis, a, b in zip("xyz", first, last, strict=True)
-    )
+        return f"iso {_num(np.mean(first))} {_num(np.mean(last))} {damping}"
+    axes = " ".join(f"{axis} {_num(a)} {_num(b)} {damping}" for axis, a, b in zip("xyz", first, last, strict=True))
     return f"{axes} couple {'xy' if stage.pressure_coupling == 'semi_isotropic' else 'none'}"
 
 

@@ -73,9 +73,7 @@ class OpenmmEngine(ExternalEngine):
         self._integrator = integrator_of(view, stage, TOLERANCES[properties.get("Precision", "double")])
         rest = mm.VerletIntegrator(0.001)
         try:
-            evaluated, moved = (
-                openmm_system(self._particles, system.state.cell, separate) for separate in (True, False)
-            )
+            evaluated, moved = (openmm_system(self._particles, system.state.cell, apart) for apart in (True, False))
             for force in extra_forces(view, stage):
                 moved.addForce(force)
             self._evaluating_context = mm.Context(evaluated, rest, there[platform], properties)

@@ -288,9 +288,8 @@ def integrator_of(view: ForceFieldView, k: int, distance_tolerance: float) -> An
         made.setRandomNumberSeed(_seed(view, k))
     elif stage.thermostat_kind == "nose_hoover":
         # OpenMM has the angular frequency of a chain, a scene its period
-        made = mm.NoseHooverIntegrator(
-            stage.temperatures[0], 2 * pi / stage.thermostat_time, dt, stage.nose_hoover_links
-        )
+        frequency = 2 * pi / stage.thermostat_time
+        made = mm.NoseHooverIntegrator(stage.temperatures[0], frequency, dt, stage.nose_hoover_links)
     else:
         made = _velocity_verlet(dt)
     made.setConstraintTolerance(distance_tolerance)
