@@ -47,8 +47,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     faults = [*_body_errors(scene, centre, moments, axes, added_mass)]
     attitude = scene.start.attitude
     spin = axes.T @ scene.start.angular_velocity  # along the principal axes
-    without_inertia = (moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))
-    if rotates and without_inertia.any():
+    if rotates and ((moments == 0) & (np.abs(spin) > 1e-12 * np.abs(spin).max(initial=0.0))).any():
         faults.append("start: the body rotates about an axis without inertia")
     faults += _integrator_errors(scene, bool(added_mass.any()), bool(applied))
     taken = {"gravity", "buoyancy", "origin_acceleration", *(f"applied_{k}" for k in range(len(scene.applied)))}
@@ -265,8 +264,7 @@ def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
 
 def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Principal moments (3,) and right-handed axes (3, 3) as columns, each as close to the body's axis as possible."""
-    rounding = ROUNDING * np.abs(tensor).max()
-    if (np.abs(tensor - np.diag(np.diag(tensor))) <= rounding).all():
+    if (np.abs(tensor - np.diag(np.diag(tensor))) <= ROUNDING * np.abs(tensor).max()).all():
         moments, axes = np.diag(tensor).copy(), np.eye(3)
         return _without_rounding(moments), axes
     moments, axes = np.linalg.eigh(tensor)
@@ -312,8 +310,7 @@ def rotor_of(scene: BodyScene, moments: np.ndarray, added_inertia: np.ndarray, a
     for wheel in scene.wheels:
         axis = axes.T @ unit_vector(wheel.axis)
         motor = wheel.motor_torque_N_m
-        values = 0.0 if motor is None else motor
-        torque = _time_function(wheel, np.multiply.outer(values, axis))
+        torque = _time_function(wheel, np.multiply.outer(0.0 if motor is None else motor, axis))
         momenta.append(integrate_function(torque, wheel.momentum_kg_m2_s * axis))
     return DrivenRotor(inertia, sum_functions(momenta) if momenta else constant_function(np.zeros(3)))
 

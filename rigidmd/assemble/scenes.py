@@ -78,8 +78,7 @@ def scene_from_atoms(
     if not atoms.pbc.any():
         box.setdefault("periodic", False)
     if "stages" not in data:
-        moves = structure["velocities"] or draws
-        data["stages"] = [{"duration_ps": DURATION} if moves else {"ensemble": "minimise"}]
+        data["stages"] = [{"duration_ps": DURATION} if structure["velocities"] or draws else {"ensemble": "minimise"}]
     data["molecules"] = _entries(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
     ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)

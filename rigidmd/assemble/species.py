@@ -173,8 +173,7 @@ def _one_molecule(path: Path, atoms: Atoms, elements: list[str]) -> list[str]:
     part = _parts(symbols, atoms.position[with_mass], None)
     count, notes = part.max(initial=-1) + 1, []
     if atoms.cell is not None:
-        joined = _parts(symbols, atoms.position[with_mass], atoms.cell).max(initial=-1) + 1
-        if joined < count:
+        if _parts(symbols, atoms.position[with_mass], atoms.cell).max(initial=-1) + 1 < count:
             why = "its atoms are bonded through the faces of its cell: make the molecule whole, without a cell"
             raise StructureError(str(path), [why])
         notes.append("its cell is ignored: the model is one rigid body of all its atoms")

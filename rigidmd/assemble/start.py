@@ -90,8 +90,7 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, start: Config
         state.angular_momentum_body[frozen[: len(state.rotation)]] = 0.0
         removed = remove_momentum(model, state.velocity)
         return ["the total momentum of the velocities in the file was removed"] if removed else []
-    temperature = not_none(scene.start.temperature_K)
-    draw_momenta(model, state, temperature, np.random.default_rng([scene.seed, MOMENTA]))
+    draw_momenta(model, state, not_none(scene.start.temperature_K), np.random.default_rng([scene.seed, MOMENTA]))
     return []
 
 
@@ -138,8 +137,7 @@ def overlaps(system: "System") -> list[str]:
     wanted = (inside, every_site), (OVERLAP * widest, lambda m: np.flatnonzero(m.epsilon > 0))
     sigma, faults = gather_per_molecule(cores, system.model.species), []
     for i, j, distance in close_pairs(system, system.state, *wanted):
-        both = sigma[i] > 0 and sigma[j] > 0
-        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if both else 0.0):
+        if distance <= max(inside, OVERLAP * (sigma[i] + sigma[j]) / 2 if sigma[i] > 0 and sigma[j] > 0 else 0.0):
             a, b = system.sites.molecule[[i, j]]
             names = " and ".join(str(system.sites.name[k]) for k in (i, j))
             faults.append(f"molecules {a + 1} and {b + 1} overlap: {names} have a distance of {distance:.3f} Å")

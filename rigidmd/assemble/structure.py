@@ -150,8 +150,7 @@ def _read_molecules(
         _check_box(path, atoms.cell, notes)
     if atoms.cell is not None and periodic and (fault := cell_error(atoms.cell)):
         raise StructureError(str(path), [f"its box: {fault}"])
-    across = atoms.cell if atoms.cell is not None or not periodic else wanted
-    matched = match(atoms, species, across, tolerance)
+    matched = match(atoms, species, atoms.cell if atoms.cell is not None or not periodic else wanted, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         faults = _unknown_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)

@@ -75,8 +75,7 @@ class RigidBodies:
         arm = position - self._mean(position)[self._molecule]
         if not len(state.rotation):
             return Load(self._sum(force), np.zeros((0, 3)))
-        torque = np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force)))
-        return Load(self._sum(force), torque)
+        return Load(self._sum(force), np.einsum("nij,ni->nj", state.rotation, self._sum(np.cross(arm, force))))
 
     def intramolecular_virial(self, position: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Sum (3, 3) of F (x) d, d from the centre of mass. The atomic virial less this is the molecular one."""

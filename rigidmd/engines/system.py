@@ -151,8 +151,7 @@ class System:
         """A new engine for this system with the given terms."""
         scene = self.scene
         virials = any(stage.ensemble == "nph" for stage in scene.stages)
-        skin = scene.forces.skin_A
-        return CpuEngine(self.model, terms, precision, skin, self.python_forces, scene.threads, virials)
+        return CpuEngine(self.model, terms, precision, scene.forces.skin_A, self.python_forces, scene.threads, virials)
 
     def of_sites(self, of: Callable[[Molecule], np.ndarray]) -> np.ndarray:
         """Values of all sites (s,); `of` returns the values of one molecule."""

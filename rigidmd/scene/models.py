@@ -160,8 +160,7 @@ class Molecule:
     @property
     def has_dipole(self) -> bool:
         """Whether the dipole moment about the centre of mass is more than a rounding error."""
-        scale = COINCIDENT * self.radius * np.abs(self.charges).sum()
-        return bool(self.dipole_debye * DEBYE > scale)
+        return bool(self.dipole_debye * DEBYE > COINCIDENT * self.radius * np.abs(self.charges).sum())
 
     @property
     def quadrupole_debye_A(self) -> np.ndarray:

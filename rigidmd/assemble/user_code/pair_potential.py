@@ -146,8 +146,7 @@ class PairLaw:
             kind.astype(np.int32), np.where(acts > 0, numbers, numbers[:, first[0], first[1]][:, None, None]), ends,
             acts,
         )  # fmt: skip
-        frozen = (system.model.inverse_mass == 0)[index]
-        term = pair_forces(potential, sites, exclusion_groups(sites, frozen))
+        term = pair_forces(potential, sites, exclusion_groups(sites, (system.model.inverse_mass == 0)[index]))
         notes = [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else []
         return term, formula, beyond if forces.tail_correction else None, notes
 

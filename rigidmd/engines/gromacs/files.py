@@ -104,8 +104,7 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     lines += [f"K{i + 1} K{j + 1} 1 {sigma[i, j]:.12g} {epsilon[i, j]:.12g}" for i, j in pairs]
     index, names = system.model.species, distinct([m.name for m in system.species])
     for k in sorted(set(index.tolist())):
-        first = int(np.flatnonzero(index == k)[0])
-        start = int(np.searchsorted(system.sites.molecule, first))
+        start = int(np.searchsorted(system.sites.molecule, int(np.flatnonzero(index == k)[0])))
         kind = view.kind[start : start + len(system.species[k].masses)]
         lines += ["", *_molecule(view, system.species[k], bodies[k], kind, names[k])]
     lines += ["", "[ system ]", f"{system.scene.name}", "", "[ molecules ]"]

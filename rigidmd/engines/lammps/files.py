@@ -62,8 +62,7 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     lines += ["", "Masses", ""]
     lines += [f"{k + 1} {_num(kind.mass or NO_MASS)} # {in_comment(kind.name)}" for k, kind in enumerate(view.kinds)]
     lines += ["", "Atoms # full", ""]
-    charge = view.charge
-    rows = zip(system.sites.molecule + 1, view.kind + 1, charge, position, image, strict=True)
+    rows = zip(system.sites.molecule + 1, view.kind + 1, view.charge, position, image, strict=True)
     lines += [
         f"{i} {m} {k} {_num(q)} {_num(x)} {_num(y)} {_num(z)} {nx} {ny} {nz}"
         for i, (m, k, q, (x, y, z), (nx, ny, nz)) in enumerate(rows, 1)
@@ -104,8 +103,7 @@ def settings(view: ForceFieldView, data: str = DATA) -> list[str]:
         lines += [f"kspace_style {style} {accuracy:.3g}", f"kspace_modify gewald {_num(forces.ewald_alpha_per_A)}"]
     lines += [f"neighbor 2.0 {'bin' if view.is_periodic else 'nsq'}", "neigh_modify every 1 delay 0 check yes"]
     lines += ["neigh_modify exclude molecule/intra all"]
-    points = ~view.is_body & ~view.frozen
-    for name, members in ((BODIES, view.is_body), (POINTS, points), (FROZEN, view.frozen)):
+    for name, members in ((BODIES, view.is_body), (POINTS, ~view.is_body & ~view.frozen), (FROZEN, view.frozen)):
         if members.any():
             numbers = np.flatnonzero(members) + 1
             runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)  # as 1:5 7 9:12
@@ -261,5 +259,4 @@ def write_lammps(folder: Path, view: ForceFieldView, state: State) -> list[str]:
     write_data(folder / DATA, view, state)
     for name, text in ((SETTINGS, "\n".join([*settings(view), ""])), (INPUT, input_script(view))):
         write_text(folder / name, text)
-    tables = [TABLES] if write_tables(folder / TABLES, view) else []
-    return [INPUT, SETTINGS, DATA, *tables]
+    return [INPUT, SETTINGS, DATA, *([TABLES] if write_tables(folder / TABLES, view) else [])]

@@ -26,8 +26,7 @@ def grid_for(view: ForceFieldView, order: int) -> tuple[int, int, int] | None:
         return a, b, c
     if not isinstance(law, ScreenedCoulomb) or system.space.volume == inf:
         return None
-    counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges = charges_in(system.species, counts)
+    charges = charges_in(system.species, np.bincount(system.model.species, minlength=len(system.species)))
     real_space = real_error(charges, law.alpha, law.cutoff, system.space.volume)
     error = sqrt(max((system.force_error or 0.0) ** 2 / COULOMB**2 - real_space**2, 0.0))
     found = pme_grid_for(charges, law.alpha, cell_of(system.space), error, order)
