@@ -145,7 +145,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F21", "a stress with shear: xz and yz exchanged",
-        "assemble/stage_flows.py",
+        "assemble/build.py",
         "tuple(x * BAR for x in ends) for ends in stage.pressures",
         "tuple(ends[i] * BAR for i in (0, 1, 2, 3, 5, 4)) for ends in stage.pressures",
         ("test_wiring.py::test_a_stress_has_its_components_in_the_order_of_the_strain",),

@@ -111,7 +111,7 @@ CORE = [
 RINGS = [
     Mutation(
         "B1", "Monte Carlo barostat: a scene passes N + 1 for N",
-        "assemble/stage_flows.py",
+        "assemble/build.py",
         "float(mobile(system.model).sum()),",
         "float(mobile(system.model).sum()) + 1.0,",
         ("test_wiring.py::test_a_monte_carlo_barostat_counts_the_molecules",),
@@ -266,7 +266,7 @@ RINGS = [
     ),
     Mutation(  # harmless within a run, whose steps count on; a stage that is run alone would repeat the numbers
         "B21", "random numbers of every stage are those of the first",
-        "assemble/stage_flows.py",
+        "assemble/build.py",
         "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, k)",
         "    thermal, key = _thermal(stage), key_of(system.scene.seed, THERMOSTAT, 0)",
         ("test_wiring.py::test_stages_have_random_numbers_of_their_own",),
@@ -294,7 +294,7 @@ RINGS = [
     ),
     Mutation(
         "B25", "cell rescaling with Langevin counts as if the total momentum were kept",
-        "assemble/stage_flows.py",
+        "assemble/build.py",
         "    x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))",
         "    x, y, z = map(float, system.model.keeps_momentum | system.keeps_momentum_in(k))",
         ("test_wiring.py::test_cell_rescaling_knows_whether_the_total_momentum_is_kept",),

@@ -255,6 +255,7 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
     "run.schedule": "CheckpointSchedule",
+    "assemble.build": "barostat_of integrator_of_stage thermostat_of",
     "scene.species": "Box",
     "assemble.start": "close_pairs every_site",
     "studies.sweep.plan": "Axis parse_axis",
@@ -281,7 +282,6 @@ HOMES = {
     "io.formats": "BY_EXTENSION",
     "io.formats.gsd": "GsdFile GsdReader",
     "assemble.memory_check": "array_bytes",
-    "assemble.stage_flows": "barostat_of integrator_of_stage thermostat_of",
     "assemble.structure": "read_structure",
     "io.structure_file": "read_atoms read_geometry",
     "io.formats.through_ase": "EV",

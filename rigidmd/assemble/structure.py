@@ -1,6 +1,7 @@
 """The starting configuration from a structure file: atoms become molecules of the scene, in its box."""
 
 # isort: skip_file
+from collections.abc import Iterator
 from math import prod
 from pathlib import Path
 from typing import NamedTuple
@@ -157,7 +158,7 @@ def _read_molecules(
         raise StructureError(str(path), faults)
     if len(matched.species) == 0:
         raise StructureError(str(path), ["has no atoms with mass"])
-    notes += [*matched.notes, *_massless(matched, species), *_other_masses(atoms, matched, species)]
+    notes += [*matched.notes, *_notes(atoms, matched, species)]
     velocity, angular = _momenta(atoms, matched, species, notes)
     sizes = np.array([len(massive_sites(molecule)) for molecule in species])[matched.species]
     return Configuration(
@@ -184,19 +185,26 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     return [fault] if unknown else []
 
 
-def _other_masses(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
-    """A note if masses in the file and in the scene differ."""
-    if atoms.masses is None:
-        return []
+def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> Iterator[str]:
+    """Notes on massless sites, whose positions follow from the template and not from the file, and on masses in the
+    file that differ from the masses of the scene."""
+    lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
+    there, expected = sum(matched.massless.values()), int(np.array(lacking)[matched.species].sum())
+    if there > expected:
+        yield f"{there - expected} sites without mass ({', '.join(matched.massless)}) are in no model: left out"
+    elif there < expected:
+        names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
+        what = f"{expected - there} sites without mass are missing in the file ({names})"
+        yield f"{what}: built from the rigid template"
     others = {}
-    for k, molecule in enumerate(species):
+    for k, molecule in enumerate(species if atoms.masses is not None else ()):
         for s, site in enumerate(massive_sites(molecule)):
             members = np.array([matched.atoms[m][s] for m in np.flatnonzero(matched.species == k)], int)
             mass = float(molecule.masses[site])
             for i in members[np.abs(atoms.masses[members] - mass) > SAME_MASS * mass]:
                 others[f"{atoms.names[i]} {atoms.masses[i]:g} and {molecule.site_names[site]} {mass:g} u"] = None
-    note = f"the masses of the scene are used, not the masses in the file ({'; '.join(others)}): masses_u changes them"
-    return [note] if others else []
+    if listed := "; ".join(others):
+        yield f"the masses of the scene are used, not the masses in the file ({listed}): masses_u changes them"
 
 
 def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
@@ -204,18 +212,6 @@ def _check_box(path: Path, cell: np.ndarray | None, notes: list[str]) -> None:
     if cell is None:
         why = f" ({'; '.join(notes)})" if notes else ""
         raise StructureError(str(path), [f"has no box{why}: give [box] lengths_A, or periodic = false"])
-
-
-def _massless(matched: MatchedMolecules, species: list[Molecule]) -> list[str]:
-    """Notes on massless sites, whose positions follow from the template and not from the file."""
-    lacking = [len(molecule.masses) - len(massive_sites(molecule)) for molecule in species]
-    expected = int(np.array(lacking)[matched.species].sum())
-    there, what = sum(matched.massless.values()), "sites without mass"
-    if there > expected:
-        return [f"{there - expected} {what} ({', '.join(matched.massless)}) are in no model: left out"]
-    names = ", ".join(molecule.name for molecule, count in zip(species, lacking, strict=True) if count)
-    missing = f"{expected - there} {what} are missing in the file ({names}): built from the rigid template"
-    return [missing] if there < expected else []
 
 
 def _momenta(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule], notes: list[str]):

@@ -5,6 +5,7 @@ terms that rigidmd itself runs, so that mixing rules, special pairs and truncati
 `unknown_terms` lists what no other program can express.
 """
 
+from collections.abc import Iterator
 from itertools import product
 from math import inf
 from typing import Any, NamedTuple, TypeVar
@@ -120,18 +121,19 @@ def force_field_of(system: System) -> ForceFieldView:
     )  # fmt: skip
 
 
-def unknown_terms(system: System) -> list[str]:
+def unknown_terms(system: System) -> Iterator[str]:
     """Messages on what acts on a system and is not in its view."""
-    found = []
     for name, term in system.terms.items():
         kind = type(term.potential if isinstance(term, PairForces) else term)
-        if name in system.user_terms or kind not in DESCRIBED:
+        what = "a user-defined force"
+        if name not in system.user_terms:
             what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
             what = "forces.ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
-            found.append(f"{name.replace('_', ' ')}: {'a user-defined force' if name in system.user_terms else what}")
-    found += ["a user-defined thermostat"] if system.thermostat is not None else []
-    return [f"{what} is left to rigidmd" for what in found]
+        if name in system.user_terms or kind not in DESCRIBED:
+            yield f"{name.replace('_', ' ')}: {what} is left to rigidmd"
+    if system.thermostat is not None:
+        yield "a user-defined thermostat is left to rigidmd"
 
 
 Potential = TypeVar("Potential")

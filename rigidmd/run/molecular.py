@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import PositiveFloat
 
-from rigidmd.assemble.build import build
-from rigidmd.assemble.stage_flows import integrator_of_stage
+from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.compile.cache import describe_cache
 from rigidmd.compile.machine import usable_threads

@@ -24,7 +24,7 @@ from math import inf, isfinite, sqrt
 
 import numpy as np
 
-from rigidmd.assemble.stage_flows import integrator_of_stage
+from rigidmd.assemble.build import integrator_of_stage
 from rigidmd.core.state import State
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
