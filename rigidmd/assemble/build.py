@@ -188,16 +188,12 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
 def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
     scene, stage = system.scene, system.scene.stages[k]
-    found, thermostat = stage.scheme, system.thermostat
+    found, thermostat, kinds = stage.scheme, system.thermostat, {other.thermostat_kind for other in scene.stages}
     if thermostat is not None and hasattr(thermostat, "for_stage"):
         thermostat = thermostat.for_stage(system, k)
     elif thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
-    elif (
-        thermostat is None
-        and not stage.has_barostat
-        and any(other.thermostat_kind == couplings.DEFAULT_THERMOSTAT for other in scene.stages)
-    ):
+    elif thermostat is None and not stage.has_barostat and couplings.DEFAULT_THERMOSTAT in kinds:
         # An idle thermostat, so that all stages run the same machine code.
         thermostat = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
     if thermostat is not None:
@@ -221,12 +217,10 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     stage, key = system.scene.stages[k], key_of(system.scene.seed, BAROSTAT, k)
     # the scene lists xy, xz, yz: components (1, 0), (2, 0), (2, 1) of the lower triangle
     pressure = Pressure(*(tuple(x * BAR for x in ends) for ends in stage.pressures), float(stage.steps))
-    tail = system.tail
-    tail_terms = (0.0, 0.0) if tail is None else (tail.energy_volume, tail.pressure_square)
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     given = Confinement(
         _thermal(stage), pressure, stage.compressibility / BAR, system.state.volume, float(mobile(system.model).sum()),
-        (x, y, z), tail_terms, key,
+        (x, y, z), tuple(system.tail or (0.0, 0.0)), key,
     )  # fmt: skip
     return BAROSTATS[stage.barostat_kind](stage, given)
 

@@ -41,11 +41,10 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
             )  # fmt: skip
         except StructureError as error:
             raise StructureError(scene.structure_source, error.errors) from None
-        faults = []
-        for k, entry in enumerate(scene.molecules):
-            present = int((found.species == k).sum())
-            if entry.count is not None and entry.count != present:
-                faults.append(f"has {present} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
+        faults, present = [], np.bincount(found.species, minlength=len(species))
+        for k, (entry, there) in enumerate(zip(scene.molecules, present, strict=True)):
+            if entry.count is not None and entry.count != there:
+                faults.append(f"has {there} molecules of {species[k].name}, molecules.{k}.count is {entry.count}")
         if scene.structure.velocities and found.velocity is None:
             why = "".join(f"; {note}" for note in found.notes if "velocit" in note)
             faults.append(f"has no velocities of all atoms{why}. Leave out structure.velocities = true")

@@ -70,10 +70,9 @@ class Translations(NamedTuple):
                 yield message
         yield from _limits(self.limits, view)
         for k, stage in enumerate(view.scene.stages):
+            messages = [key.refusal(self.title, getattr(stage, key.name)) for key in self.stage]
             if not stage.is_minimisation:
-                messages = (key.refusal(self.title, getattr(stage, key.name)) for key in self.stage)
-                yield from (f"stages.{k}.{message}" for message in messages if message)
-                yield from (f"stages.{k}.{message}" for message in _limits(self.stage_limits, stage))
+                yield from (f"stages.{k}.{m}" for m in (*messages, *_limits(self.stage_limits, stage)) if m)
 
 
 def _limits(limits: tuple[Limit, ...], subject: Any) -> Iterator[str]:

@@ -184,12 +184,11 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
 
 
 def _couplings(stage: Stage) -> dict[str, object]:
-    found: dict[str, object] = {"tcoupl": "no", "pcoupl": "no"}
     if not stage.has_thermostat:
-        return found
+        return {"tcoupl": "no", "pcoupl": "no"}
     first, last = stage.temperatures
-    found |= {
-        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1], "tc-grps": "System",
+    found: dict[str, object] = {
+        "tcoupl": TRANSLATIONS.of("thermostat")[stage.thermostat][1], "pcoupl": "no", "tc-grps": "System",
         "ref-t": f"{first:.12g}", "tau-t": f"{stage.thermostat_time:.12g}",
     }  # fmt: skip
     if stage.thermostat_kind == "nose_hoover":

@@ -91,11 +91,9 @@ def layout(view: ForceFieldView) -> Layout:
         at, of_particles = body.particles(len(m.masses))
         local.append(at)
         mass.append(np.zeros_like(of_particles) if is_frozen else of_particles)
-    count = np.array([len(of_species) for of_species in mass])[species]
-    first = np.cumsum(count) - count
-    sites = system.sites_per_molecule
+    count, sites = np.array([len(of_species) for of_species in mass])[species], system.sites_per_molecule
+    first, molecule = np.cumsum(count) - count, np.repeat(np.arange(len(species)), count)
     within = np.arange(sites.sum()) - np.repeat(np.cumsum(sites) - sites, sites)
-    molecule = np.repeat(np.arange(len(species)), count)
     points = Points(
         np.repeat(np.arange(len(species)), [len(local[k]) for k in species]),
         gather_per_molecule([body.position_body for body in bodies], species),
