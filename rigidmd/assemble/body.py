@@ -218,7 +218,7 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
     body = scene.body
     centre = np.array(body.centre_of_mass_m or (0.0, 0.0, 0.0))
     mass = body.mass_kg or 0.0  # with points: their sum, below
-    tensor = body.tensor
+    tensor = np.zeros((3, 3)) if body.tensor is None else body.tensor
     if body.points is not None:
         masses = np.array([p.mass_kg for p in body.points])
         positions = np.array([p.position_m for p in body.points])
@@ -230,12 +230,8 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
         shape = solid(body.solid.shape, mass, body.solid.dimensions)
         points, tensor = shape.outline, np.diag(shape.inertia)
     else:
-        about_centre = np.zeros((3, 3)) if tensor is None else tensor
-        if body.inertia_about == "pivot":
-            about_centre = shifted_inertia(about_centre, -mass, centre)
-        points = _equal_ellipsoid(mass, about_centre)
-    if tensor is None:
-        tensor = np.zeros((3, 3))
+        about_pivot = body.inertia_about == "pivot"
+        points = _equal_ellipsoid(mass, shifted_inertia(tensor, -mass, centre) if about_pivot else tensor)
     if body.pinned:
         if body.inertia_about == "centre_of_mass":
             tensor = shifted_inertia(tensor, mass, centre)
@@ -265,8 +261,7 @@ def _equal_ellipsoid(mass: float, tensor: np.ndarray) -> np.ndarray:
 def principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Principal moments (3,) and right-handed axes (3, 3) as columns, each as close to the body's axis as possible."""
     if (np.abs(tensor - np.diag(np.diag(tensor))) <= ROUNDING * np.abs(tensor).max()).all():
-        moments, axes = np.diag(tensor).copy(), np.eye(3)
-        return _without_rounding(moments), axes
+        return _without_rounding(np.diag(tensor)), np.eye(3)
     moments, axes = np.linalg.eigh(tensor)
     best = max(permutations(range(3)), key=lambda order: sum(abs(axes[k, order[k]]) for k in range(3)))
     moments, axes = np.maximum(moments, 0.0)[list(best)], axes[:, best]

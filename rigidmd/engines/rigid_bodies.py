@@ -29,9 +29,8 @@ class RigidBodies:
     def __init__(self, system: System, points: Points | None = None):
         model, sites = system.model, system.sites if points is None else points
         self._inverse = model.inverse_inertia[model.species]
-        self._molecule, self._body = sites.molecule, sites.offset_body
+        self._molecule, self._body, self._weight = sites.molecule, sites.offset_body, sites.mass
         self._count = len(model.species)
-        self._weight = sites.mass
         self._mass = model.mass[model.species]
         self._inertia = model.inertia[model.species]
         self._frozen = (model.inverse_mass == 0)[model.species]

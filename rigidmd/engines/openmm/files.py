@@ -129,14 +129,10 @@ def _topology(particles: Layout) -> "Topology":
 
     made, system = app.Topology(), particles.view.system
     chain = made.addChain()
-    index = system.model.species
-    count = [*particles.first, len(particles.mass)]
-    for n, k in enumerate(index):
-        m = system.species[k]
+    for k in system.model.species:
+        m, extra = system.species[k], particles.of_species[k].extra
         residue = made.addResidue(str(m.residue_names[0]), chain)
-        for j in range(int(count[n + 1] - count[n])):
-            is_site = j < len(m.masses)
-            name = m.site_names[j] if is_site else f"P{j - len(m.masses) + 1}"
-            symbol = m.elements[j] if is_site else "X"
+        names = [*m.site_names, *(f"P{j + 1}" for j in range(extra))]
+        for name, symbol in zip(names, [*m.elements, *["X"] * extra], strict=True):
             made.addAtom(name, None if symbol == "X" else app.Element.getBySymbol(symbol), residue)
     return made
