@@ -71,10 +71,9 @@ def scene_from_atoms(
     given = [key for key in ("file", "frame", "topology") if isinstance(structure, Mapping) and key in structure]
     if faults := faults + [f"structure.{key} is given by the atoms" for key in given]:
         raise SceneError(SOURCE, faults)
-    has_momenta = atoms.has("momenta")
     draws = start.get("temperature_K") is not None
     structure["file"] = STRUCTURE
-    structure.setdefault("velocities", has_momenta and not draws)
+    structure.setdefault("velocities", atoms.has("momenta") and not draws)
     if not atoms.pbc.any():
         box.setdefault("periodic", False)
     if "stages" not in data:

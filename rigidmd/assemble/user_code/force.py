@@ -1,6 +1,6 @@
 """Forces that users write in plain Python."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
@@ -81,7 +81,7 @@ class BoundForce:
         self._by_site = type(force).on_sites is not Force.on_sites
         if self._by_site == (type(force).on_molecules is not Force.on_molecules):
             raise UserForceError(f"the force {name} must define one of on_sites and on_molecules")
-        self._called("begin", force.begin, system)
+        self._called("begin", system)
         n, turns = len(system.state.velocity), len(system.state.rotation) > 0
         self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
 
@@ -91,7 +91,7 @@ class BoundForce:
         if self._by_site:
             energy, force, torque, virial = self._of_sites(_read_only(self.system.site_positions(state)), state)
         else:
-            energy, force, torque, virial = self._parts(self._called("on_molecules", self.force.on_molecules, state), 4)
+            energy, force, torque, virial = self._parts(self._called("on_molecules", state), 4)
         self._fill(workspace.force, force, "forces")
         self._fill(workspace.torque_body, torque, "torques")
         if not np.isfinite(energy):
@@ -104,7 +104,7 @@ class BoundForce:
         workspace.fresh[0] = 1
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
-        energy, force, virial, _ = self._parts(self._called("on_sites", self.force.on_sites, position, state), 3)
+        energy, force, virial, _ = self._parts(self._called("on_sites", position, state), 3)
         on_sites, molecule = np.zeros(position.shape), self.system.sites.molecule
         self._fill(on_sites, force, "forces", molecule, 1.0)
         total, torque = np.zeros((len(state.velocity), 3)), None
@@ -149,9 +149,9 @@ class BoundForce:
     def _error(self, what: str) -> UserForceError:
         return UserForceError(f"the force {self.name} returned {what}")
 
-    def _called(self, what: str, function: Callable, *arguments: Any) -> Any:
+    def _called(self, what: str, *arguments: Any) -> Any:
         try:
-            return function(*arguments)
+            return getattr(self.force, what)(*arguments)
         except (Exception, SystemExit) as error:  # user code may raise anything
             trace = error.__traceback__
             while trace is not None and trace.tb_next is not None:

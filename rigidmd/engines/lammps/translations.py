@@ -3,7 +3,6 @@
 from rigidmd.engines.external import SPLIT, Key, Limit, Translations, is_langevin, moves
 
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
-_BAROSTAT = "LAMMPS has its own for rigid bodies; leave barostat out"
 
 TRANSLATIONS = Translations(
     "LAMMPS",
@@ -15,35 +14,27 @@ TRANSLATIONS = Translations(
         Key("forces.electrostatics", {  # kspace style
             "none": "", "reaction_field": "", "damped_shifted_force": "", "ewald": "ewald", "pme": "pppm",
         }, matters=lambda view: view.coulomb),
-        Key(
-            "forces.ewald_truncation", {None: "", "plain": ""},
-            "LAMMPS has no shift of the real-space energy; take 'plain'", lambda view: view.has_ewald_sum,
-        ),
-        Key(
-            "run.remove_momentum_interval_ps", {None: "", False: ""},
-            "LAMMPS removes no momentum of rigid bodies; leave it out",
-        ),
+        Key("forces.ewald_truncation", {None: "", "plain": ""},
+            "LAMMPS has no shift of the real-space energy; take 'plain'", lambda view: view.has_ewald_sum),
+        Key("run.remove_momentum_interval_ps", {None: "", False: ""},
+            "LAMMPS removes no momentum of rigid bodies; leave it out"),
     ),
     stage=(
         Key("ensemble", {"nve": "nve", "nvt": "nvt", "npt": "npt", "nph": "nph"}),
         Key("thermostat", {None: "", "nose_hoover": "", "langevin": ""},
             "LAMMPS has nose_hoover and langevin for rigid bodies"),
-        Key("barostat", {None: ""}, _BAROSTAT),
+        Key("barostat", {None: ""}, "LAMMPS has its own for rigid bodies; leave barostat out"),
         Key("pressure_coupling", {"isotropic": "iso", "semi_isotropic": "couple xy", "anisotropic": "couple none"},
             "LAMMPS' barostat for rigid bodies keeps the angles of the box"),
         _INTEGRATOR, Key("rotor", SPLIT, "LAMMPS' rotation is split"),
     ),
     limits=(
-        Limit(
-            "a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them",
-            lambda view: view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any(),
-        ),
+        Limit("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them",
+            lambda view: view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any()),
     ),
     stage_limits=(
         *_LIMITS,
-        Limit(
-            "ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only",
-            lambda stage: is_langevin(stage) and stage.has_barostat,
-        ),
+        Limit("ensemble = 'npt': LAMMPS' barostat for rigid bodies works with nose_hoover only",
+            lambda stage: is_langevin(stage) and stage.has_barostat),
     ),
 )  # fmt: skip

@@ -60,9 +60,8 @@ TRANSLATIONS = Translations(
         _INTEGRATOR, Key("rotor", SPLIT, "OpenMM rotates molecules by constrained distances"),
     ),
     limits=(
-        Limit(f"forces.electrostatics = {{!r}}: {_NO_GRID}", lambda view: (
-            view.has_ewald_sum and grid_for(view, PME_ORDER) is None and view.scene.forces.electrostatics
-        )),
+        Limit(f"forces.electrostatics = {{!r}}: {_NO_GRID}",
+            lambda view: view.has_ewald_sum and grid_for(view, PME_ORDER) is None and view.electrostatics),
         Limit("a barostat with frozen molecules: OpenMM would move them with the box",
             lambda view: view.frozen.any() and view.has_barostat),
     ),
