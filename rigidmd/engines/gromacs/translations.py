@@ -47,9 +47,11 @@ TRANSLATIONS = Translations(
     limits=(
         Limit("no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box",
             lambda view: not view.is_periodic or view.system.cutoff == inf),
-        Limit("forces.truncation = {!r} with reaction_field: GROMACS has plain and shift for it; use one of them, or pme",
+        Limit(
+            "forces.truncation = {!r} with reaction_field: GROMACS has plain and shift for it; use one of them, or pme",
             lambda view: view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift")
-            and view.truncation),
+            and view.truncation,
+        ),
         Limit("frozen molecules: GROMACS would compute forces between them", lambda view: view.frozen.any()),
         Limit("{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane",
             lambda view: ", ".join(m.name for m in view.system.species if len(gromacs_points(m).mass) > 3)),
