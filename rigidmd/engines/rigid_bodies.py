@@ -130,7 +130,7 @@ OFF = 1e-9
 SAME = 1e-12
 #: The same for sides of triangles in OpenMM, which compares distances in single precision.
 ISOSCELES = 1e-6
-TRIANGLE = np.array([[0, 1, 0], [-sqrt(0.75), -0.5, 0], [sqrt(0.75), -0.5, 0]]) * sqrt(2)
+TRIANGLE = np.array([[0, 1], [-sqrt(0.75), -0.5], [sqrt(0.75), -0.5]]) * sqrt(2)
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 
@@ -171,11 +171,6 @@ class MassPoints(NamedTuple):
                 found.append((j, i, next((other for *_, other in found if abs(d - other) <= SAME * d), d)))
         return found
 
-    def positions(self, point: np.ndarray) -> dict[int, np.ndarray]:
-        """Positions of the virtual sites for points (p, 3)."""
-        normal = np.cross(point[1] - point[0], point[2] - point[0]) if len(point) == 3 else np.zeros(3)
-        return {k: site.weight @ point + site.cross * normal for k, site in self.virtual_sites.items()}
-
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
     """The mass points of a molecule; all its sites if it is frozen. `sites`: whether sites may be the points if just
@@ -183,31 +178,25 @@ def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) ->
     if frozen:
         return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
     mass, position, site = _points(molecule, sites)
-    virtual = {
-        k: _virtual_site(position, where, OFF * molecule.radius)
-        for k, where in enumerate(molecule.positions_body)
-        if k not in site
-    }
+    limit, others = OFF * molecule.radius, np.setdiff1d(np.arange(len(molecule.masses)), site).tolist()
+    virtual = {k: _virtual_site(position, molecule.positions_body[k], limit) for k in others}
     return MassPoints(mass, position, site, virtual)
 
 
 def _points(molecule: Molecule, sites: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masses, positions and sites of the points: the sites if just enough of them have mass, else a simplex."""
-    heavy = np.flatnonzero(molecule.masses > 0)
-    total, inertia = molecule.mass, molecule.inertia
-    second = np.maximum(inertia.sum() / 2 - inertia, 0.0)  # sum of m x² along each axis
+    heavy, total, inertia = np.flatnonzero(molecule.masses > 0), molecule.mass, molecule.inertia
     if not inertia.any():
         return np.array([total]), np.zeros((1, 3)), heavy[:1]
     if sites and _can_be_points(molecule, heavy):
         return molecule.masses[heavy], molecule.positions_body[heavy], heavy
+    second = np.maximum(inertia.sum() / 2 - inertia, 0.0)  # sum of m x² along each axis
     reach = np.sqrt(second / total)
     if molecule.kind == "linear":
         points = np.array([[-1.0, 0, 0], [1, 0, 0]])
         reach[1:] = 0.0
     elif second.min() <= FLAT * second.max():
-        points = np.zeros((3, 3))
-        across = int(second.argmin())
-        points[:, [k for k in range(3) if k != across]] = TRIANGLE[:, :2]
+        points = np.insert(TRIANGLE, int(second.argmin()), 0.0, axis=1)
     else:
         points = TETRAHEDRON
     count = len(points)
