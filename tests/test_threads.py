@@ -69,6 +69,18 @@ def test_every_block_is_done_once(threads, blocks, work):
     assert seen[:, 1] == pytest.approx([sum(np.sqrt(np.arange(work) + b)) for b in range(blocks)])
 
 
+def test_every_block_is_done_once_by_many_more_threads():
+    """As on a machine with 24 cores. Few blocks are usual: a small PME grid has three."""
+    script = (
+        "from test_threads import counted; assert all((counted(n, 10, 2000)[:, 0] == 2000).all() for n in range(1, 9))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT / "tests", env=os.environ | {"NUMBA_NUM_THREADS": "24"},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 @task()
 def _note(task_arguments, block):
     order = load_arguments(task_arguments)
@@ -91,6 +103,7 @@ def _take_alone(cells, job, address, room, blocks, own, threads):
         (1, 3, [0] * 6, [3, 2, 1, 0, 5, 4]),
         (1, 2, [4, 4, 6, 4, 8, 6], []),  # the job has ended, others have begun
         (3, 8, [0] * 6, [2, 1, 0, 5, 4, 3]),  # more threads than blocks
+        (1, 16, [0] * 6, [0, 5, 4, 3, 2, 1]),  # more than twice as many
     ],
 )
 def test_each_thread_begins_with_its_share_and_goes_on_with_what_is_left(own, threads, claimed, expected):

@@ -150,7 +150,7 @@ def _run_ranges(pool, job, address, task_arguments, blocks, thread, threads):
     ranges = min(blocks, MOST_RANGES)
     last = False
     up = thread % 2 == 0
-    at = thread * ranges // threads if up else (thread + 1) * ranges // threads - 1
+    at = thread * ranges // threads if up else max(0, (thread + 1) * ranges // threads - 1)
     for _ in range(ranges):
         begun = _read(pool, RANGE_JOBS + at)
         # A range of an earlier job has this number or a later one: all were begun before the next job was written.
