@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+# Tests run on all cores: a second process for each that compiles would only take time from the others.
+os.environ.setdefault("RIGIDMD_COMPILERS", "1")
 # A worker holds a million objects of Numba. To search them for cycles as often as Python does took 15 % of its time.
 gc.set_threshold(50_000, 20, 20)
 

@@ -72,9 +72,14 @@ def shared_folder() -> str | None:
     return str(folder) if cache_folder() != str(folder) and folder.is_dir() else None
 
 
+def is_persistent() -> bool:
+    """Whether compiled code is stored where other processes read it."""
+    return cache_folder() == str(_folder_of_sources())
+
+
 def describe_cache() -> str:
     """Whether compiled code is stored, for messages."""
-    if cache_folder() == str(_folder_of_sources()):
+    if is_persistent():
         return "kept on disk: the next run starts at once"
     folder = _folder_of_sources().parent
     return f"not kept, as {folder} cannot be written: the next run compiles again; RIGIDMD_CACHE names another folder"

@@ -9,7 +9,7 @@ Private parts of Numba and llvmlite, each tested by tests/test_compile.py:
 - A `Compiler` creates its library unless its state has one. A library optimises its module in `_optimize_final_module`
   and makes machine code in `_finalize_final_module`. The variables of a module that point to environments have names
   that begin with `_ZN08NumbaEnv`; Numba sets them in machine code.
-- A `CFunc` compiles for given types and accepts another cache.
+- A `CFunc` compiles for given types, accepts another cache, and calls `_compile_uncached` if the cache has no code.
 """
 
 import functools
@@ -192,9 +192,22 @@ class InnerKernel(KernelDispatcher):
 LINKED_OPTIONS = {"pipeline_class": LinkedCompiler}
 
 
-def compile_callback(function: Callable, arguments: tuple, options: dict) -> CFunc:
-    """A function compiled for these types of arguments, or read from the cache; it is called by address."""
+def compile_callback(function: Callable, arguments: tuple, options: dict, stored_only: bool = False) -> CFunc:
+    """A function compiled for these types of arguments, or read from the cache; it is called by address.
+
+    stored_only : raise `NotStored` if it is not in the cache
+    """
     code = CFunc(function, (arguments, types.void), locals={}, options=options)
     code._cache = open_cache(function)
+    if stored_only:
+        code._compile_uncached = _refuse
     code.compile()
     return code
+
+
+class NotStored(Exception):
+    """Raised instead of compiling."""
+
+
+def _refuse():
+    raise NotStored

@@ -10,8 +10,8 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.units import KJ_PER_MOL
 
-#: Tolerance of pair sums, relative to their size: engines have slightly different constants, such as 332.06371. Energies
-#: of OpenMM in single precision differ by up to 3e-7.
+#: Tolerance of pair sums, relative to their size: engines have slightly different constants, such as 332.06371.
+#: Energies of OpenMM in single precision differ by up to 3e-7.
 PLAIN = 1e-6
 #: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels repulsion.
 STEEPEST = 12

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from rigidmd.compile import set_threads
+from rigidmd.compile import compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
@@ -104,6 +104,7 @@ class CpuEngine(Engine):
         self._evaluated: Load | None = None
         self._box_workspace: BarostatWorkspace | None = None
         self._stale = True
+        self._first = True
         self._checked: State | None = None
         self._moved: State | None = None
         self._observed_load: Load | None = None  # returned by the last `evaluate_current`
@@ -317,8 +318,18 @@ class CpuEngine(Engine):
         if isinstance(self.model, Model):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
-            self._workspaces = tuple(with_code(workspace) for workspace in self.new_workspaces(state))
+            spaces = self.new_workspaces(state)
+            if self._first and isinstance(self.model, Model):
+                compile_together(lambda: self._compile(spaces))
+            self._first = False
+            self._workspaces = tuple(with_code(workspace) for workspace in spaces)
         return self._workspaces
+
+    def _compile(self, spaces: tuple[NamedTuple, ...]) -> None:
+        """Compile all code for molecules that does not depend on a thermostat or a barostat."""
+        workspaces = tuple(with_code(workspace) for workspace in spaces)
+        TermDispatcher(workspaces, True, self._setup.with_energies)
+        molecule_code(self.model, NoThermostat())
 
     def _handle_status(self, status: int, state: State) -> tuple[NamedTuple, ...]:
         """Handle a status code of a kernel, and return the workspaces with which to call it again."""
