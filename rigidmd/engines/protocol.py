@@ -72,21 +72,17 @@ class Engine(Protocol):
     def sums(self, state: State, load: Load) -> StateSums | None:
         """Sums over the state that was just moved and its load from `evaluate_current`, if its last step has added them
         up."""
-        return None
 
     def extent(self, state: State) -> LargestValues | None:
         """Largest values in the state that was just moved and its load, if its last step has found them."""
-        return None
 
     @property
     def moves(self) -> tuple[int, int] | None:
         """Moves of the box, tried and accepted so far."""
-        return None
 
     @property
     def chosen_steps(self) -> tuple[int, int] | None:
         """Steps that a solver has chosen itself, and its evaluations of forces."""
-        return None
 
     @abstractmethod
     def snapshot(self) -> State:
@@ -103,7 +99,6 @@ class Engine(Protocol):
     def check(self, state: State, integrator: Scheme | Solver, dt: float, start: State | None) -> None:
         """Raise ValueError unless a recalled state agrees with its extra variables. `start`: the start of the run, if
         forces have not changed since."""
-        return None
 
     @abstractmethod
     def forget(self) -> None:
@@ -115,11 +110,9 @@ class Engine(Protocol):
 
     def rotor(self, model: Any) -> "NamedTuple | None":
         """The rotor by which rigidmd rotates bodies exactly as this engine does, if there is one."""
-        return None
 
     def close(self) -> None:
         """End what the engine has started outside this process."""
-        return None
 
 
 class Halted(Exception):

@@ -4,8 +4,9 @@ This is the Python side of the kernels: it owns their lists, grids, sums and mac
 returns that one is full, and raises exceptions for status codes.
 """
 
+# isort: skip_file
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Protocol, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,17 +15,8 @@ from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
-    BEHIND_WALL,
-    CELL_CHANGED,
-    EXAMPLE,
-    LIST_FULL,
-    NEEDS_PYTHON_FORCES,
-    NOT_FINITE,
-    NOW,
-    Load,
-    State,
-    no_load,
-)
+    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, Load, State, no_load,
+)  # fmt: skip
 from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
@@ -36,39 +28,23 @@ from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import LennardJonesWalls
 from rigidmd.forces.terms import (
-    NoForce,
-    Setup,
-    TermDispatcher,
-    checkpoint_arrays,
-    compute_load_with_energies,
-    restored,
-    with_capacity,
-    with_code,
-    with_common_scratch,
-    workspace_of,
-)
+    NoForce, Setup, TermDispatcher, checkpoint_arrays, compute_load_with_energies, restored, with_capacity, with_code,
+    with_common_scratch, workspace_of,
+)  # fmt: skip
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
 Precision = Literal["double", "mixed"]
-#: Owners of arrays in `Engine.memory` besides the terms, and the arrays of each.
+#: Owners of arrays in `Engine.memory` besides the terms, and the arrays of a barostat.
 LOAD, BOX = "load", "box"
-MEMORY_FIELDS = {LOAD: Load._fields, BOX: ("tally", "known", "counts")}
+BOX_FIELDS = ("tally", "known", "counts")
 
 #: dt, `until` and `observed` of `Engine.advance`.
 Steps = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
 #: Relative difference of forces and virials between two machines, by arithmetic.
 ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
-
-
-class ComputedByPython(Protocol):
-    """The workspace of a term that a Python function computes."""
-
-    def update(self, function: Callable, state: State) -> None:
-        """Fill the workspace in for a state by calling the function."""
-        ...
 
 
 class CpuEngine(Engine):
@@ -89,9 +65,7 @@ class CpuEngine(Engine):
         self, model: Model | Body, terms: dict[str, NamedTuple], precision: Precision = "double", skin: float = 1.9,
         python_forces: dict[str, Callable] | None = None, threads: int | None = None, needs_virials: bool = False
     ):  # fmt: skip
-        self.model = model
-        self.terms = terms
-        self.names = list(terms)
+        self.model, self.terms, self.names = model, terms, list(terms)
         self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, np.ones(1, np.int64), needs_virials)
         self._python_forces = python_forces or {}
         self.threads = threads
@@ -172,19 +146,18 @@ class CpuEngine(Engine):
 
     def _flow_arguments(self, integrator: Scheme, state: State) -> tuple:
         """The arguments of the compiled step loop that depend on the integrator."""
-        if integrator.has_gradient and self._probe is None:
-            self._probe = gradient_workspace(state)
-        if integrator.barostat is not None and self._box_workspace is None:
-            self._box_workspace = barostat_workspace(state)
-        probe = self._probe if integrator.has_gradient else None
-        box = self._box_workspace if integrator.barostat is not None else None
+        probe = box = None
+        if integrator.has_gradient:
+            probe = self._probe = self._probe or gradient_workspace(state)
+        if integrator.barostat is not None:
+            box = self._box_workspace = self._box_workspace or barostat_workspace(state)
         flows = integrator.thermostat or NoThermostat(), integrator.barostat or NoBarostat(), flow_arrays(integrator)
         return *flows, probe, self._heat, box
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
-            is_molecular = isinstance(self.model, Model)
-            self._dispatchers[use] = TermDispatcher(workspaces, is_molecular, self._setup.with_energies)
+            molecular = isinstance(self.model, Model)
+            self._dispatchers[use] = TermDispatcher(workspaces, molecular, self._setup.with_energies)
         return self._dispatchers[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
@@ -204,14 +177,8 @@ class CpuEngine(Engine):
         return self._copies(load, dispatcher)
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        moving = self._dispatchers.get("steps")
-        if (
-            self.load is None
-            or moving is None
-            or state is not self._moved
-            or self._stale
-            or not moving.table.tallies_valid[0]
-        ):
+        moving, is_current = self._dispatchers.get("steps"), state is self._moved and not self._stale
+        if self.load is None or moving is None or not (is_current and moving.table.tallies_valid[0]):
             return self.evaluate(state)
         self._observed_load, tallies = self._copies(self.load, moving)
         return self._observed_load, tallies
@@ -238,12 +205,12 @@ class CpuEngine(Engine):
 
     def memory(self) -> dict[str, np.ndarray] | None:
         """Neighbour lists as last built, forces at the present positions, and the memory of the barostat."""
-        found = {}
-        for name, workspace in self.workspaces.items():
-            found |= {f"{name}.{key}": array for key, array in checkpoint_arrays(workspace).items()}
+        owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
         if self.load is not None and not self._stale:
-            found |= self._arrays_of(self.load, LOAD)
-        return found | (self._arrays_of(self._box_workspace, BOX) if self._box_workspace is not None else {})
+            owners[LOAD] = self.load._asdict()
+        if self._box_workspace is not None:
+            owners[BOX] = {key: getattr(self._box_workspace, key) for key in BOX_FIELDS}
+        return {f"{owner}.{key}": array for owner, arrays in owners.items() for key, array in arrays.items()}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
         self._prepare(state)
@@ -251,7 +218,7 @@ class CpuEngine(Engine):
         for name, array in memory.items():
             owner, _, key = name.rpartition(".")
             kept.setdefault(owner, {})[key] = array
-        if unknown := kept.keys() - {*self.names, *MEMORY_FIELDS}:
+        if unknown := kept.keys() - {*self.names, LOAD, BOX}:
             raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
         self._recall_lists(state, kept)
         self.load, self._stale = no_load(state), LOAD not in kept
@@ -297,10 +264,6 @@ class CpuEngine(Engine):
         elif not same:
             raise ValueError("its neighbour lists are not those of its state")
 
-    @staticmethod
-    def _arrays_of(arrays: NamedTuple, owner: str) -> dict[str, np.ndarray]:
-        return {f"{owner}.{name}": getattr(arrays, name) for name in MEMORY_FIELDS[owner]}
-
     @property
     def moves(self) -> tuple[int, int]:
         return (0, 0) if (box := self._box_workspace) is None else (int(box.counts[0]), int(box.counts[1]))
@@ -313,7 +276,10 @@ class CpuEngine(Engine):
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays of a state for compiled code, and return the workspaces, which the first use makes."""
         if state is not self._checked:
-            _check_arrays(state)
+            for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
+                if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
+                    kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
+                    raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
             self._checked = state
         if isinstance(self.model, Model):
             set_threads(usable_threads(self.threads))
@@ -345,7 +311,7 @@ class CpuEngine(Engine):
         elif status == NEEDS_PYTHON_FORCES:
             for name, workspace in zip(self.names, workspaces, strict=False):
                 if name in self._python_forces:
-                    cast(ComputedByPython, workspace).update(self._python_forces[name], state)
+                    workspace.update(self._python_forces[name], state)  # type: ignore[attr-defined]  # of such terms
         return workspaces
 
 
@@ -365,13 +331,6 @@ def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
         there[:] = array
-
-
-def _check_arrays(state: State) -> None:
-    for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
-        if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
-            kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
-            raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
 
 
 class BehindWallError(SimulationError):

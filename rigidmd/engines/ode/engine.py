@@ -5,6 +5,7 @@ pinned, and the work of drives and resistance, for the energy balance. Solvers: 
 DOP853 and Radau. They are an independent check of the integrators, and only their accuracy keeps Q a rotation.
 """
 
+# isort: skip_file
 from collections.abc import Callable
 
 import numpy as np
@@ -19,13 +20,8 @@ from rigidmd.engines.ode.rates import SINGULAR, is_singular, moment_rates_of, re
 from rigidmd.engines.protocol import Halted, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.odes import (
-    AttitudeForm,
-    EulerAngles,
-    Matrix,
-    NoAttitude,
-    Quaternion,
-    attitude_variables,
-)
+    AttitudeForm, EulerAngles, Matrix, NoAttitude, Quaternion, attitude_variables,
+)  # fmt: skip
 
 FORMS: dict[str, AttitudeForm] = dict(zip(FORMULATIONS, (Matrix(), Quaternion(), EulerAngles()), strict=True))
 
@@ -79,10 +75,16 @@ class OdeEngine(CpuEngine):
         form = _form(solver, state)
         if self.load is None:
             self.load = no_load(state)
-        if solver.name == RK4:
-            self._rk4(form, state, dt, until)
-        else:
+        if solver.name != RK4:
             self._adaptive(form, state, solver, dt, until)
+            return
+        y = state.extra_variables
+        cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
+        while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
+            if status == SINGULAR:
+                raise SingularError(y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt)
+            self._handle_status(status, state)
+        read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
     def memory(self) -> dict[str, np.ndarray] | None:
         """As `Engine.memory`; None for Radau, which would resume only within its tolerance."""
@@ -115,15 +117,6 @@ class OdeEngine(CpuEngine):
         super().forget()
         self._solver = self._dense_output = None
         self._restart = True
-
-    def _rk4(self, form: AttitudeForm, state: State, dt: float, until: int) -> None:
-        y = state.extra_variables
-        cursor, stages = np.zeros(1, np.int64), np.zeros((5, len(y)))
-        while status := rk4(form, self.model, self._workspaces, state, self.load, y, stages, dt, until, cursor):
-            if status == SINGULAR:
-                raise SingularError(y[1], state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt)
-            self._handle_status(status, state)
-        read(form, self.model, state, state.time[ORIGIN] + (until - state.step[ORIGIN]) * dt, y)
 
     def _adaptive(self, form: AttitudeForm, state: State, solver: Solver, dt: float, until: int) -> None:
         variables = len(state.extra_variables) // 3
