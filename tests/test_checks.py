@@ -97,11 +97,12 @@ def test_a_molecule_that_moves_or_turns_too_far():
     assert "watch.turn_rad = 2" in said
 
 
-def test_sites_inside_one_another():
+@pytest.mark.parametrize("edge", [20.0, None])
+def test_sites_inside_one_another(edge):
     def overlap(state):
         state.position[11] = state.position[4] + [1.5, 0.0, 0.0]
 
-    said = stopped(small_scene({"argon": 20}, 20.0), change=overlap)
+    said = stopped(small_scene({"argon": 20}, edge), change=overlap)
     assert "changes a momentum of molecule" in said
     assert "AR of molecule 5 (argon) and AR of molecule 12 (argon) are 1.5 Å apart, 0.44 of their diameter" in said
     assert "Likely cause: these sites overlap" in said

@@ -218,7 +218,7 @@ def _first_overlap(
     """Time and sites of the first overlap of this molecule, or else of any."""
     first: tuple[str, OverlappingPair | None] = ("", None)
     for where, state in states:
-        if not all(np.isfinite(array).all() for array in state):
+        if np.isnan(state.cell).any() or not all(np.isfinite(a).all() for a in (state.position, state.rotation)):
             continue
         pair = most_overlapping_pair(system, state, molecule)
         if pair is not None and (molecule is None or molecule in system.sites.molecule[[pair.first, pair.second]]):
