@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from rigidmd.assemble.user_code.force import Force, HasStage, HasTerm
     from rigidmd.assemble.user_code.pair_potential import PairLaw
     from rigidmd.engines.body_system import Pose
+    from rigidmd.run.minimise import OverlapRemoval
     from rigidmd.run.molecular import MolecularRun
 
     UserForce = Force | PairLaw | HasTerm | NamedTuple
@@ -173,6 +174,16 @@ class Simulation(Displayed):
     def start_from(self, state: State) -> None:
         """Let runs of molecules begin at the given positions and momenta, without removal of overlaps."""
         self._molecules().start_from(state)
+
+    def start(self) -> "OverlapRemoval | None":
+        """Go to the state of molecules before the first step, from which `run` starts. Returns the removal of
+        overlaps."""
+        return self._molecules().start()
+
+    def settle(self) -> State:
+        """Go to the state of molecules after removal of overlaps and the minimisations that come first, from which time
+        passes."""
+        return self._molecules().settle()
 
     def atoms(self) -> "ase.Atoms":
         """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers may call it."""

@@ -282,7 +282,7 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
         resolved = simulation.scene
         earlier = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
         return simulation, earlier.run().state
-    simulation.part.start()
+    simulation.start()
     return simulation, simulation.state
 
 
