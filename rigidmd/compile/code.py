@@ -323,7 +323,7 @@ def compile_together(make: Callable[[], object]) -> None:
     """Compile every `Code` that a function makes, in two processes if that saves time.
 
     Python and LLVM compile one function at a time per process. A second process begins with the last task, and this one
-    with the first: on two idle cores the first steps of 216 waters come after 37 s instead of 55 s. The environment
+    with the first: on two idle cores the first steps of 216 waters come after 37 s instead of 54 s. The environment
     variable `RIGIDMD_COMPILERS` is the number of processes, 1 or 2. The function is first called only to collect the
     tasks and types of its codes. These have no addresses, so it must not call them.
     """
