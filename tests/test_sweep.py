@@ -604,7 +604,7 @@ def test_a_script_for_slurm(argon, finished, slurm, capsys):
 @pytest.mark.soak
 def test_slurm_jobs_submit_themselves_again(argon, slurm):
     """Jobs whose time is up, until their points have finished."""
-    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=400", "-o", "sweep"]
+    arguments = ["sweep", str(argon), "--set", "seed=1..2", "--set", "stages.0.duration_ps=2500", "-o", "sweep"]
     assert cli.main([*arguments, "--to", "slurm", "--walltime", "0:00:08"]) == 0
     subprocess.run(["sbatch", "sweep/sweep.sbatch"], check=True)
     assert len(Path("jobs").read_text().splitlines()) > 2
