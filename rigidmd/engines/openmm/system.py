@@ -1,7 +1,7 @@
 """A system as an `openmm.System`: particles, constraints, virtual sites, and forces in separate groups.
 
-OpenMM has no rigid bodies. Mass points with constrained distances represent them (`mass_points`), and all other sites
-are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
+OpenMM has no rigid bodies. Mass points with constrained distances represent them (`rigid_bodies.MassPoints`), and all
+other sites are virtual. OpenMM's units are nm, ps, u, e and kJ/mol.
 """
 
 import re
