@@ -110,7 +110,7 @@ def build():
 """.replace("PACKAGE", "rigidmd")  # test_support.py would take these imports for ours
     assert [message.split(":")[0] for message in upward("scene", imports_in(source))] == ["6", "8", "9", "10"]
     assert not list(upward("__init__", imports_in(source)))
-    inner = [(1, "rigidmd.io.formats.xtc"), (2, "rigidmd.io.formats"), (3, "rigidmd.io.trajectory"), (4, "rigidmd.io")]
+    inner = [(1, "rigidmd.io.formats.gro"), (2, "rigidmd.io.formats"), (3, "rigidmd.io.trajectory"), (4, "rigidmd.io")]
     assert [message.split(":")[0] for message in upward("scene", inner)] == ["3", "4"]
     assert [message.split(":")[0] for message in upward("dynamics", inner)] == ["1", "2", "3", "4"]
 

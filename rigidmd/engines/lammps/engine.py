@@ -1,6 +1,6 @@
 """The engine that runs LAMMPS: a process on one or more MPI ranks that reads commands line by line.
 
-States are sent as data files and received as binary dumps of sites in full precision. `evaluate` returns what LAMMPS
+States are sent as data files and received as dumps of sites with 17 digits, which keep every bit. `evaluate` returns what LAMMPS
 has computed at the end of a chunk of steps, so that observations need no additional forces.
 """
 
@@ -8,7 +8,6 @@ import contextlib
 import os
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
@@ -28,10 +27,10 @@ from rigidmd.engines.observables import kinetic_energies
 from rigidmd.engines.protocol import NotFiniteError, Tally
 from rigidmd.engines.rigid_bodies import RigidBodies
 from rigidmd.engines.system import System
-from rigidmd.errors import EngineError, SimulationError
+from rigidmd.errors import EngineError, SimulationError, StructureError
 from rigidmd.forces.ewald.corrections import background, self_energy
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.io.formats.lammps import box_in_bounds
+from rigidmd.io.formats.lammps import dump_box
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, SplitRotor
 
 #: Begins a line with numbers, which also ends the output of a command.
@@ -39,7 +38,7 @@ NUMBERS = "rigidmd:"
 #: Columns of a dump.
 COLUMNS = ("id", "x", "y", "z", "ix", "iy", "iz", "vx", "vy", "vz", "fx", "fy", "fz")
 PER_PS = 1e3  # Å/fs in Å/ps
-DUMP = "state.bin"
+DUMP = "state.dump"
 #: Number of lines of output that are searched for an error.
 QUOTED_FROM = 200
 
@@ -142,7 +141,7 @@ class LammpsEngine(ExternalEngine):
         energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.has_ewald_sum else [])
         names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]
         figures = self._process.run_commands(
-            f"write_dump all custom {DUMP} {' '.join(COLUMNS)}",
+            f"write_dump all custom {DUMP} {' '.join(COLUMNS)} modify sort id format float %.17g",
             f'print "{NUMBERS} {" ".join(f"$({name}:%.17g)" for name in names)}"',
         )
         cell, rows = read_dump(self._process.folder / DUMP)
@@ -236,38 +235,11 @@ def _ended(process: subprocess.Popen, pipes: list[IO[str]], folder: tempfile.Tem
 
 
 def read_dump(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The first frame of a binary dump (`dump custom` to a file with extension .bin, in the format since 2020) whose
-    first column is the number of the atom: the cell (3, 3) and the rows, sorted by this column. Raises EngineError."""
-    data = path.read_bytes()
-    at = 0
-
-    def take(form: str) -> tuple:
-        nonlocal at
-        found = struct.unpack_from(f"<{form}", data, at)
-        at += struct.calcsize(f"<{form}")
-        return found
-
+    """The cell (3, 3) and the rows of a dump of one frame. Raises EngineError."""
     try:
-        (mark,) = take("q")  # below zero: the length of the name that follows
-        if take(f"{max(-mark, 0)}s") != (b"DUMPCUSTOM",):
-            raise ValueError("not a file of `dump custom`")
-        *_, slanted = take("iiqqi")  # byte order, revision, step, number of atoms
-        xlo, xhi, ylo, yhi, zlo, zhi = take("6i6d")[6:]  # after the kinds of boundaries
-        xy, xz, yz = take("3d") if slanted else (0.0, 0.0, 0.0)
-        columns, units = take("ii")
-        take(f"{units}s")
-        if take("c") != (b"\0",):
-            take("d")  # time
-        (words,) = take("i")
-        take(f"{words}s")
-        (pieces,) = take("i")
-        rows = []
-        for _ in range(pieces):
-            (count,) = take("i")
-            rows.append(np.frombuffer(data, np.float64, count, at).reshape(-1, columns))
-            at += 8 * count
-    except (struct.error, ValueError) as error:
+        with path.open(encoding="utf-8") as file:
+            head = [(k, file.readline().split()) for k in range(1, 10)]
+            rows = np.loadtxt(file, ndmin=2)
+        return dump_box(path, [], head[5:8])[1], rows
+    except (ValueError, StructureError) as error:
         raise EngineError(f"LAMMPS wrote a dump that cannot be read: {error}") from None
-    _, cell = box_in_bounds(np.array([xlo, ylo, zlo]), np.array([xhi, yhi, zhi]), xy, xz, yz)
-    table = np.concatenate(rows)
-    return cell, table[table[:, 0].argsort()]

@@ -257,7 +257,7 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         rows.sort(key=lambda row: parse_whole_number(row[1][columns["id"]]) or 0)
     begin = at["BOX BOUNDS"]
     bounds = [(first + k + 1, lines[k].split()) for k in range(begin + 1, begin + 4)]
-    low, cell = _dump_box(path, lines[begin].split()[3:], bounds)
+    low, cell = dump_box(path, lines[begin].split()[3:], bounds)
     there = next((names for names in COORDINATES if set(names) <= set(columns)), None)
     if there is None:
         raise structure_error(path, f"line {first + atoms + 1}: has no columns of coordinates, x y z or xs ys zs")
@@ -288,19 +288,17 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
     return _in_our_units(found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)")
 
 
-def _dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
+def dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
+    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box. kinds : the words
+    after BOX BOUNDS"""
     bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
         raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))
     if general:
         return bounds[:, 3], bounds[:, :3]
-    return box_in_bounds(bounds[:, 0], bounds[:, 1], *(bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)))
-
-
-def box_in_bounds(low: np.ndarray, high: np.ndarray, xy: float, xz: float, yz: float) -> tuple[np.ndarray, np.ndarray]:
-    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box."""
-    low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
-    high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
+    xy, xz, yz = bounds[:, 2] if bounds.shape[1] > 2 else np.zeros(3)
+    low = bounds[:, 0] - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
+    high = bounds[:, 1] - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
     cell = np.diag(high - low)
     cell[1, 0], cell[2, 0], cell[2, 1] = xy, xz, yz
     return low, cell

@@ -1,4 +1,4 @@
-"""Frames in the formats of MDAnalysis: the file of one frame by its writers, and the arrays of one by its readers."""
+"""Frames in the formats of MDAnalysis: the file of one frame by its writers, and reading in another process."""
 
 import contextlib
 import os
@@ -8,7 +8,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,6 @@ from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import edges_and_angles
 from rigidmd.io.formats import System
 from rigidmd.io.formats.atoms import Frame, structure_error
-
-NM = 10.0  # Å
 
 
 def dimensions(cell: np.ndarray | None) -> list[float] | None:
@@ -86,49 +83,6 @@ def scratch_file() -> Iterator[str]:
 def content_of(path: str) -> bytes:
     with open(path, "rb", buffering=0) as file:
         return file.readall()
-
-
-def step_in_32_bits(step: int) -> int:
-    """As in GROMACS, which has 32 bits of the step."""
-    return (step + 2**31) % 2**32 - 2**31
-
-
-def arrays_of_xdr(name: str, path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """A frame of .xtc or .trr, by the library of MDAnalysis' readers, which themselves write files with offsets."""
-    library = import_module("MDAnalysis.lib.formats.libmdaxdr")
-    with getattr(library, name)(path) as file:
-        _check(file.n_atoms, atoms)
-        file.seek(k := index_of(len(file), frame))
-        found = file.read()
-        if not getattr(found, "hasx", True):
-            raise ValueError(f"frame {k + 1} has no positions")
-        arrays = {"position": found.x * NM}
-        if getattr(found, "hasv", False):
-            arrays["velocity"] = found.v * NM
-        if found.box.any():
-            arrays["cell"] = found.box * NM
-    return arrays
-
-
-def arrays_of_reader(name: str, path: str, frame: int, atoms: int) -> dict[str, np.ndarray]:
-    """A frame by the reader of MDAnalysis for the format of this name."""
-    from MDAnalysis.coordinates.core import get_reader_for
-
-    reader_class: Any = get_reader_for(path, name)
-    with reader_class(path) as reader:
-        _check(reader.n_atoms, atoms)
-        found = reader[index_of(reader.n_frames, frame)]
-        arrays = {"position": found.positions}
-        if found.has_velocities:
-            arrays["velocity"] = found.velocities
-        if found.dimensions is not None:
-            arrays["cell"] = found.triclinic_dimensions
-    return arrays
-
-
-def _check(there: int, wanted: int) -> None:
-    if there != wanted:
-        raise ValueError(f"it has {there} atoms, the file with their names {wanted}")
 
 
 #: The arguments of Python that run `main`.
