@@ -334,7 +334,6 @@ HOMES = {
     "engines.observables": "Observation kinetic_energies",
     "engines.samples": "BODY BODY_COLUMNS COLUMNS Sample Samples",
     "run.pilot.shadow": "bias_of_potential mean_square_rate",
-    "studies.stability.outcomes": "CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step",
     "run.pilot.stable_step": "DIRECTIONS step_warnings stable_angle stiffest_mode",
     "run.summary": "ewald_error_notes summarise",
     "run.pilot.trials": "Method IntegratorAccuracy TrialSystem Trial measure time_span",
@@ -389,7 +388,9 @@ HOMES = {
     "studies.compare": "compare describe_run_comparison",
     "studies.accuracy.accuracy": "measure_accuracy",
     "studies.stability.report": "run_cases selected_cases",
-    "studies.stability.cases": "CASES StabilityCase",
+    "studies.stability.cases": (
+        "CASES CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step"
+    ),
     "studies.sweep.backends": "Cluster Pool",
     "studies.sweep.table": "SweepRow summarise_run",
     "studies.other_engines": "export verify",
@@ -409,7 +410,6 @@ RENAMED = {
     "own_energy_and_force": "forces.potentials.custom:energy_and_force",
     "accuracy_recommendations": "studies.accuracy.report:recommendations",
     "accuracy_table": "studies.accuracy.report:table_text",
-    "stability_failed": "studies.stability.report:has_failed",
     "stability_case_figure": "studies.stability.report:case_figure",
     "stability_table": "studies.stability.report:table_text",
     "stability_conclusions": "studies.stability.report:conclusions",

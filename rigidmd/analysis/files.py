@@ -1,5 +1,6 @@
 """Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each curve."""
 
+# isort: skip_file
 import csv
 import re
 from collections.abc import Callable
@@ -16,15 +17,8 @@ from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import (
-    COLORS,
-    FAINT,
-    INK,
-    label_minor_ticks,
-    new_figure,
-    open_axis,
-    thin_series,
-    write_figure,
-)
+    COLORS, FAINT, INK, label_minor_ticks, new_figure, open_axis, thin_series, write_figure,
+)  # fmt: skip
 from rigidmd.io.folder import add_to_folder, written_by_runs
 from rigidmd.io.run_files import Bounded, read_columns, read_json
 from rigidmd.io.write import nine_digits, write_csv, write_json

@@ -17,7 +17,7 @@ from rigidmd.commands.arguments import Options, argument, command, output_folder
 def _stability(options: Options) -> int:
     import platform
 
-    from rigidmd.studies.stability.report import FILES, conclusions, has_failed, run_cases, table_text, write_stability
+    from rigidmd.studies.stability.report import FILES, conclusions, run_cases, table_text, write_stability
 
     folder = Path(options.output) if options.output else Path("runs") / "stability"
     machine = platform.processor() or platform.machine()
@@ -26,4 +26,4 @@ def _stability(options: Options) -> int:
         lambda results: [table_text(results), "", *conclusions(results)],
         lambda folder, results, command: write_stability(folder, results, command, machine),
     )  # fmt: skip
-    return FAILED if has_failed(results) else 0
+    return FAILED if any(result.failures for result in results) else 0

@@ -1,5 +1,6 @@
 """Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
 
+# isort: skip_file
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,20 +10,9 @@ from rigidmd.core.files import atomic_file
 from rigidmd.engines.body_motion import Motion, drawn_axis
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import (
-    COOL,
-    FAINT,
-    INK,
-    UP,
-    WARM,
-    camera,
-    circle,
-    draw_front_and_back,
-    globe,
-    new_figure,
-    save_figure,
-    settings,
+    COOL, FAINT, INK, UP, WARM, camera, circle, draw_front_and_back, globe, new_figure, save_figure, settings,
     thin_series,
-)
+)  # fmt: skip
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.translation import InertialFrame
 

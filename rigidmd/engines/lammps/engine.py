@@ -1,7 +1,7 @@
 """The engine that runs LAMMPS: a process on one or more MPI ranks that reads commands line by line.
 
-States are sent as data files and received as dumps of sites with 17 digits, which keep every bit. `evaluate` returns what LAMMPS
-has computed at the end of a chunk of steps, so that observations need no additional forces.
+States are sent as data files and received as dumps of sites with 17 digits, which keep every bit. `evaluate` returns
+what LAMMPS has computed at the end of a chunk of steps, so that observations need no additional forces.
 """
 
 import contextlib

@@ -1,5 +1,6 @@
 """Readers of LAMMPS' data files and text dumps. Atoms have types, which get names from labels, masses or the scene."""
 
+# isort: skip_file
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -13,16 +14,8 @@ from rigidmd.core.toml import parse_whole_number
 from rigidmd.errors import StructureError
 from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN,
-    Atoms,
-    atom_count,
-    element_of_mass,
-    is_element,
-    numbers,
-    structure_error,
-    table,
-    unexpected,
-)
+    HEAVY_HYDROGEN, Atoms, atom_count, element_of_mass, is_element, numbers, structure_error, table, unexpected,
+)  # fmt: skip
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
 #: Columns of the section Atoms by atom style. Three image numbers may follow. a, b, c are columns that are not used.

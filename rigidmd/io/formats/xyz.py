@@ -1,5 +1,6 @@
 """XYZ, plain and extended. ASE reads it, with corrections before and after."""
 
+# isort: skip_file
 import io
 import re
 from collections.abc import Callable
@@ -9,15 +10,8 @@ from pathlib import Path
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN,
-    Atoms,
-    Frame,
-    atom_count,
-    is_element,
-    numbers,
-    structure_error,
-    without_fortran,
-)
+    HEAVY_HYDROGEN, Atoms, Frame, atom_count, is_element, numbers, structure_error, without_fortran,
+)  # fmt: skip
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import FrameFiles
 

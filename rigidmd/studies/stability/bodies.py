@@ -1,5 +1,6 @@
 """Stability cases: single bodies, free at every speed, tops, friction and fluids."""
 
+# isort: skip_file
 from collections.abc import Callable
 from math import expm1, log
 
@@ -9,8 +10,9 @@ from scipy.special import ellipkm1
 
 from rigidmd.mechanics.rotation import from_quaternion, from_vector
 from rigidmd.run.results import Results
-from rigidmd.studies.stability.cases import EXACT, POINT, SPLIT, TEXTBOOK, families, register, run_body
-from rigidmd.studies.stability.outcomes import REFUSED, RIGHT, CaseResult, longest_step
+from rigidmd.studies.stability.cases import (
+    EXACT, POINT, REFUSED, RIGHT, SPLIT, TEXTBOOK, CaseResult, families, longest_step, register, run_body,
+)  # fmt: skip
 
 
 def rotation_error(rotation: np.ndarray) -> Callable[[Results], float]:

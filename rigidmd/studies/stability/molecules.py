@@ -1,5 +1,6 @@
 """Stability cases: molecules that collide, overlap or lack repulsion; extreme boxes and densities; invalid input."""
 
+# isort: skip_file
 import resource
 import tempfile
 from collections.abc import Iterator
@@ -16,19 +17,9 @@ from rigidmd.core.state_file import write_state
 from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.stability.cases import (
-    EXACT,
-    SPLIT,
-    attempt,
-    body_scene,
-    energy_error,
-    families,
-    molecules_scene,
-    register,
-    run_invalid,
-    run_molecules,
-    simulate,
-)
-from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
+    EXACT, REFUSED, REPORTED, RIGHT, SPLIT, CaseResult, Outcome, attempt, body_scene, energy_error, families,
+    longest_step, molecules_scene, register, run_invalid, run_molecules, simulate,
+)  # fmt: skip
 from rigidmd.units import BOLTZMANN
 
 #: A bent molecule of three sites with Lennard-Jones and charges, of the same kind of scene as water.

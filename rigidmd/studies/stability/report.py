@@ -1,32 +1,31 @@
-"""`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv, .md and a page."""
+"""`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv and a page."""
 
 import html
 import time as clock
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from math import inf, isfinite, isnan
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import write_text
 from rigidmd.errors import SceneError
 from rigidmd.figures.style import INK, curve_style, label_minor_ticks, new_figure, open_axis
 from rigidmd.io.write import columns_text, format_cell, write_csv
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
-from rigidmd.studies.stability.cases import CASES, StabilityCase
-from rigidmd.studies.stability.outcomes import BOUND, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
+from rigidmd.studies.stability.cases import BOUND, CASES, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide, write_page
 
-FILES = ("stability.csv", "stability.html", "stability.md")
+FILES = ("stability.csv", "stability.html")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
 KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))  # how a verdict is shown
 MESSAGES = 3  # messages of a case at most
 FLOOR = 1e-17  # errors of exactly 0 are drawn here
 
 
-def selected_cases(names: list[str] | None) -> list[StabilityCase]:
+def selected_cases(names: list[str] | None) -> list[CaseResult]:
     """The cases of these names, or all. Raises SceneError with a suggestion."""
     if unknown := [name for name in names or [] if name not in CASES]:
         known = f"(known: {', '.join(CASES)})"
@@ -41,7 +40,7 @@ def run_cases(
     cases = selected_cases(names)
     for k, case in enumerate(cases):
         progress(k / len(cases), case.name)
-        result = CaseResult(case.name, case.group, case.sentence, *case.titles)
+        result = replace(case, runs=[], limits=[], notes=[])
         began = clock.perf_counter()
         case.run(result, quick)
         result.seconds = clock.perf_counter() - began
@@ -95,10 +94,6 @@ def conclusions(results: list[CaseResult]) -> list[str]:
     return [*failures, *unexpected, total]
 
 
-def has_failed(results: list[CaseResult]) -> bool:
-    return any(result.failures for result in results)
-
-
 def write_stability(folder: Path, results: list[CaseResult], command: str, machine: str) -> list[Path]:
     titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
@@ -117,22 +112,8 @@ def write_stability(folder: Path, results: list[CaseResult], command: str, machi
         ]  # fmt: skip
     cells = [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
     write_csv(folder / FILES[0], [titles, *cells])
-    write_text(folder / FILES[2], markdown(results, command, machine))
     write_page(folder / FILES[1], lambda: stability_page(results, command, machine))
     return [folder / name for name in FILES if (folder / name).is_file()]
-
-
-def markdown(results: list[CaseResult], command: str, machine: str) -> str:
-    lines = ["# Stability", "", f"`{command}` on {machine}; {sum(f.seconds for f in results):.0f} s.", ""]
-    lines += [f"- *{verdict}*: {meaning}" for verdict, meaning in VERDICTS.items()]
-    bound = f"- *longest step*: at which conserved quantities stay within {BOUND:g} of the kinetic energy, bisected"
-    lines += [bound, "", "| " + " | ".join(HEADERS) + " |", "|" + "---|" * len(HEADERS)]
-    lines += ["| " + " | ".join(x.replace("|", "\\|") for x in line) + " |" for line in rows_of(results)]
-    lines += ["", "## Cases", ""]
-    for f in results:
-        lines.append(f"- **{f.name}** ({f.group}): {f.sentence}.")
-        lines += [f"  - {note}" for note in f.notes]
-    return "\n".join([*lines, "", *(f"- {line}" for line in conclusions(results)), ""])
 
 
 def case_figure(result: CaseResult, styles: dict[str, dict] | None = None):

@@ -1,5 +1,6 @@
 """Stability cases: water from 0 K to 1e5 K, its longest steps, equipartition, the thermostat."""
 
+# isort: skip_file
 from functools import cache
 from math import hypot, sqrt
 
@@ -7,9 +8,11 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
-from rigidmd.studies.stability.cases import QUICK, SPLIT, attempt, molecules_scene, register, run_molecules, simulate
+from rigidmd.studies.stability.cases import (
+    QUICK, REFUSED, REPORTED, RIGHT, SPLIT, CaseResult, Outcome, attempt, longest_step, molecules_scene, register,
+    run_molecules, simulate,
+)  # fmt: skip
 from rigidmd.studies.stability.molecules import WATER_FORCES, bent
-from rigidmd.studies.stability.outcomes import REFUSED, REPORTED, RIGHT, CaseResult, Outcome, longest_step
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 WATERS = 64

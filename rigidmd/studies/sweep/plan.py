@@ -3,6 +3,7 @@
 The scenes of all points are read and checked before the first one runs, then merged with the folder of the sweep.
 """
 
+# isort: skip_file
 import hashlib
 import json
 import re
@@ -20,18 +21,9 @@ from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
 from rigidmd.run.resume import NOT_COMPARED, differences, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.studies.sweep.folder import (
-    SEED,
-    Manifest,
-    SweepPoint,
-    clear_sweep,
-    describe_values,
-    is_sweep,
-    point_name,
-    read_manifest,
-    short_keys,
-    state_on_disk,
-    value_name,
-)
+    SEED, Manifest, SweepPoint, clear_sweep, describe_values, is_sweep, point_name, read_manifest, short_keys,
+    state_on_disk, value_name,
+)  # fmt: skip
 
 MOST_POINTS = 100_000  # largest number of points of a sweep
 OPTION = "--set"
