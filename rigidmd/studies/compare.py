@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigidmd.core.files import unreadable_reason
+from rigidmd.core.state import State
 from rigidmd.core.state_file import read_state
 from rigidmd.core.toml import read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
@@ -78,11 +79,25 @@ def compare(first: Path, second: Path) -> RunComparison:
     for folder in (first, second):
         check_is_run(folder)
     found = RunComparison((str(first), str(second)))
-    scenes = [_read(folder / SCENE, found, lambda path: read_toml(path, SceneError)[0]) for folder in (first, second)]
-    if None not in scenes:
+
+    def either(name: str) -> bool:
+        return (first / name).exists() or (second / name).exists()
+
+    def both(name: str, read: Callable[[Path], Any]) -> list[Any]:
+        """The content of this file in both folders; empty, which `missing` explains, if one of them cannot be read."""
+        contents = []
+        for path in (first / name, second / name):
+            try:
+                content, why = read(path), f"{path} does not exist"
+            except RigidMDError as error:
+                content, why = None, str(error)
+            contents += [] if content is None else [content]
+            found.missing += [why] if content is None else []
+        return contents if len(contents) == 2 else []
+
+    if scenes := both(SCENE, lambda path: read_toml(path, SceneError)[0]):
         found.scene = differences(*(keys_of(scene, ("name", "threads")) for scene in scenes))
-    summaries = [_read(folder / SUMMARY, found, lambda path: read_json(path, Summary)) for folder in (first, second)]
-    if None not in summaries:
+    if summaries := both(SUMMARY, lambda path: read_json(path, Summary)):
         made = []
         for there in (summary.model_dump(exclude_unset=True) for summary in summaries):
             of_run = {key.replace("_", " "): there[key] for key in VERSIONS_AND_MACHINE if key in there}
@@ -90,30 +105,23 @@ def compare(first: Path, second: Path) -> RunComparison:
             made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
         found.made = differences(made[0], made[1], "not recorded")
     for name in (LOG, MOTION):
-        if any((folder / name).exists() for folder in (first, second)):
-            tables = [_read(folder / name, found, read_columns) for folder in (first, second)]
-            if None not in tables:
-                found.samples = _compare_samples(name, *tables)
-    _compare_states(first / FINAL, second / FINAL, found)
+        if either(name) and (tables := both(name, read_columns)):
+            found.samples = _compare_samples(name, *tables)
+    if either(FINAL) and (saved := both(FINAL, read_state)):
+        for name, a, b in zip(State._fields, *(of.state for of in saved), strict=True):
+            if a.shape != b.shape:
+                found.state[name] = None
+            elif a.tobytes() != b.tobytes():
+                found.state[name] = float(np.abs(a - b).max())
     for key in ("output.topology", "output.trajectory"):
-        names = [keys_of(scene, ()).get(key) for scene in scenes if scene]
-        if len(names) == 2 and isinstance(name := names[0], str) and names[1] == name and Path(name).name == name:
+        names = [keys_of(scene, ()).get(key) for scene in scenes]
+        if scenes and isinstance(name := names[0], str) and names[1] == name and Path(name).name == name:
             paths = first / name, second / name
             if missing := [f"{path}: {reason}" for path in paths if (reason := unreadable_reason(path))]:
                 found.missing += missing
             else:
                 found.files[name] = filecmp.cmp(*paths, shallow=False)
     return found
-
-
-def _read(path: Path, found: RunComparison, read: Callable[[Path], Any]) -> Any:
-    """The content of a file; None, which `missing` explains, if it cannot be read."""
-    try:
-        content, why = read(path), f"{path} does not exist"
-    except RigidMDError as error:
-        content, why = None, str(error)
-    found.missing += [why] if content is None else []
-    return content
 
 
 def _compare_samples(file: str, one: Columns, other: Columns) -> SampleComparison:
@@ -165,20 +173,6 @@ def last_bits(first: str, second: str) -> int | None:
         return None
     ordered = [int(x) if x >= 0 else -(int(x) & (2**63 - 1)) for x in numbers]
     return min(abs(ordered[0] - ordered[1]).bit_length(), BITS)
-
-
-def _compare_states(first: Path, second: Path, found: RunComparison) -> None:
-    """Find the largest difference of each array of two final states."""
-    if not first.exists() and not second.exists():
-        return
-    one, other = (_read(path, found, read_state) for path in (first, second))
-    if one is None or other is None:
-        return
-    for name, a, b in zip(one.state._fields, one.state, other.state, strict=True):
-        if a.shape != b.shape:
-            found.state[name] = None
-        elif a.tobytes() != b.tobytes():
-            found.state[name] = float(np.abs(a - b).max())
 
 
 def describe_run_comparison(found: RunComparison) -> str:
