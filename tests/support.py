@@ -410,7 +410,6 @@ RENAMED = {
     "own_energy_and_force": "forces.potentials.custom:energy_and_force",
     "accuracy_recommendations": "studies.accuracy.report:recommendations",
     "accuracy_table": "studies.accuracy.report:table_text",
-    "stability_case_figure": "studies.stability.report:case_figure",
     "stability_table": "studies.stability.report:table_text",
     "stability_conclusions": "studies.stability.report:conclusions",
     "tree_ahead": "forces.neighbors.tree:ahead",

@@ -18,7 +18,6 @@ from support import (
     run_cases,
     selected_cases,
 )
-from support import stability_case_figure as case_figure
 from support import stability_conclusions as conclusions
 from support import stability_table as table_text
 
@@ -97,7 +96,6 @@ def test_the_longest_step_is_found_by_bisection(beyond, way, start):
     limit = longest_step(lambda step: Outcome(reported_error=1e-4) if step <= 0.73 else beyond, start)
     assert 0.73 / 1.11 < limit.longest <= 0.73
     assert limit.beyond == way == failure(beyond)
-    assert list(limit.curve) == sorted(limit.curve)
 
 
 def test_a_step_that_never_fails_and_one_that_never_holds():
@@ -124,7 +122,7 @@ def test_the_command_writes_its_files_and_does_not_overwrite(tmp_path, capsys):
     assert {line["verdict"] for line in lines} == {"right"}
     assert all(float(line["error"]) <= float(line["allowed"]) for line in lines)
     page = (tmp_path / "out" / "stability.html").read_text()
-    assert "<svg" in page and "<script" not in page and "src=" not in page
+    assert "largest |Q - Q of the body itself|" in page and "<script" not in page and "src=" not in page
     assert page.count('id="case-inertia_scale"') == 1 and 'href="#case-inertia_scale"' in page
     assert main(arguments) == 2
     assert "--force" in capsys.readouterr().err
@@ -152,16 +150,3 @@ def test_the_help_has_an_example(capsys):
     with pytest.raises(SystemExit):
         main(["stability", "--help"])
     assert "rigidmd stability --quick --case" in capsys.readouterr().out
-
-
-def test_what_was_refused_far_away_does_not_stretch_a_figure():
-    result = CaseResult("made_up", 1, "A case", "x", "error")
-    for x in (1.0, 10.0, 1e300):
-        result.add("once", Outcome(1e-9, 0.0) if x < 1e9 else Outcome(message="too far"), x, "a family", x)
-    assert case_figure(result).axes[0].get_xlim()[1] < 1e9
-
-
-def test_a_case_without_numbers_has_no_figure():
-    result = CaseResult("made_up", 1, "A case")
-    result.add("once", Outcome(message="no"), 0.0, expected=(REFUSED,))
-    assert case_figure(result) is None

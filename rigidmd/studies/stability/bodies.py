@@ -70,16 +70,16 @@ def exponents(first: int, last: int, quick: bool) -> list[int]:
     return [-k for k in (every if not quick else np.unique(np.linspace(first, last, 4).astype(int)))]
 
 
-def compare_with_dop853(result: CaseResult, quick: bool, settings: list[tuple[str, float, tuple, tuple]]) -> None:
-    """Rotate each (setting, x, moments, omega) by each family for a span, and compare with DOP853."""
-    for setting, x, inertia, omega in settings:
+def compare_with_dop853(result: CaseResult, quick: bool, settings: list[tuple[str, tuple, tuple]]) -> None:
+    """Rotate each (setting, moments, omega) by each family for a span, and compare with DOP853."""
+    for setting, inertia, omega in settings:
         truth = free_rotation(inertia, omega, SPAN)
         # L is exact to rounding, so omega about an axis with little inertia only to that divided by the inertia
         rounding = 4 * np.finfo(float).eps * np.sqrt(SPAN / STEP) * max(inertia) / min(inertia)
         for family in families(quick):
             outcome = run_body(free(inertia, omega), STEP, SPAN, family, rotation_error(truth))
             expected = (RIGHT, REFUSED) if min(inertia) < 1e-12 * max(inertia) else (RIGHT,)
-            result.add(setting, outcome, ALLOWED.get(family, EXACTLY) + rounding, family, x, STEP, expected)
+            result.add(setting, outcome, ALLOWED.get(family, EXACTLY) + rounding, family, STEP, expected)
 
 
 def find_step_limits(result: CaseResult, quick: bool, setting: str, inertia) -> None:
@@ -90,29 +90,29 @@ def find_step_limits(result: CaseResult, quick: bool, setting: str, inertia) -> 
         result.limits.append(longest_step(run, STEP, setting, family))
 
 
-@register(1, x="I1/I2", error="error of Q after 20 s")
+@register(1, error="error of Q after 20 s")
 def near_linear(result: CaseResult, quick: bool) -> None:
     """Bodies that approach a line, I1/I2 from 1e-1 to 1e-15 and exactly 0."""
     ratios = [10.0**k for k in exponents(1, 15, quick)]
-    compare_with_dop853(result, quick, [(f"I1/I2 = {r:.0e}", r, (r, 1.0, 1.0 + r), OMEGA) for r in ratios])
+    compare_with_dop853(result, quick, [(f"I1/I2 = {r:.0e}", (r, 1.0, 1.0 + r), OMEGA) for r in ratios])
     across = np.array([0.0, 1.0, -0.4])
     truth = from_vector(across * SPAN)
     for family in families(quick):
         outcome = run_body(free((0.0, 1.0, 1.0), across), STEP, SPAN, family, rotation_error(truth))
-        result.add("I1 = 0", outcome, EXACTLY, family, ratios[-1] / 10, STEP)
+        result.add("I1 = 0", outcome, EXACTLY, family, STEP)
     find_step_limits(result, quick, "I1/I2 = 1e-06", (1e-6, 1.0, 1.0 + 1e-6))
 
 
-@register(2, x="relative difference of two moments", error="error of Q after 20 s")
+@register(2, error="error of Q after 20 s")
 def near_symmetric(result: CaseResult, quick: bool) -> None:
     """Two moments with relative differences of 1e-1 to 1e-16; all three, nearly a sphere."""
     gaps = [10.0**k for k in exponents(1, 16, quick)]
-    compare_with_dop853(result, quick, [(f"oblate, {g:.0e}", g, (1.0, 1.0 + g, 1.5), OMEGA) for g in gaps])
-    compare_with_dop853(result, quick, [(f"sphere, {g:.0e}", g, (1.0, 1.0 + g, 1.0 + 0.3 * g), OMEGA) for g in gaps])
+    compare_with_dop853(result, quick, [(f"oblate, {g:.0e}", (1.0, 1.0 + g, 1.5), OMEGA) for g in gaps])
+    compare_with_dop853(result, quick, [(f"sphere, {g:.0e}", (1.0, 1.0 + g, 1.0 + 0.3 * g), OMEGA) for g in gaps])
     find_step_limits(result, quick, "oblate, 1e-02", (1.0, 1.01, 1.5))
 
 
-@register(2, x="factor on the inertia", error="largest |Q - Q of the body itself|")
+@register(2, error="largest |Q - Q of the body itself|")
 def inertia_scale(result: CaseResult, quick: bool) -> None:
     """The same body with its inertia scaled by 1e-15 to 1e15: the same motion to rounding."""
     inertia = np.array([1.0, 1.7, 2.4])
@@ -120,10 +120,10 @@ def inertia_scale(result: CaseResult, quick: bool) -> None:
     for scale in (1e-15, 1e15) if quick else (1e-90, 1e-45, 1e-15, 1e15, 1e45, 1e90):
         for family in families(quick):
             outcome = run_body(free(scale * inertia), STEP, SPAN, family, rotation_error(truth))
-            result.add(f"times {scale:.0e}", outcome, ALLOWED.get(family, EXACTLY), family, scale, STEP)
+            result.add(f"times {scale:.0e}", outcome, ALLOWED.get(family, EXACTLY), family, STEP)
 
 
-@register(3, x="angle of omega off the axis (rad)", error="error of Q after 20 s")
+@register(3, error="error of Q after 20 s")
 def along_axes(result: CaseResult, quick: bool) -> None:
     """L exactly along each principal axis, and off it by 1e-16 to 1e-2; L = 0."""
     inertia = (1.0, 2.0, 2.6)
@@ -131,14 +131,14 @@ def along_axes(result: CaseResult, quick: bool) -> None:
         aside = np.roll([0.0, 0.6, 0.8], k)
         offs = [0.0] + [10.0**e for e in exponents(2, 16, quick)]
         axis = np.eye(3)[k]
-        settings = [(f"axis {k + 1}, off by {off:.0e}", max(off, 1e-17), inertia, axis + off * aside) for off in offs]
+        settings = [(f"axis {k + 1}, off by {off:.0e}", inertia, axis + off * aside) for off in offs]
         compare_with_dop853(result, quick, settings)
     for family in families(quick):
         outcome = run_body(free(inertia, (0, 0, 0)), STEP, SPAN, family, rotation_error(np.eye(3)))
-        result.add("at rest", outcome, 0.0, family, 1e-17, STEP)
+        result.add("at rest", outcome, 0.0, family, STEP)
 
 
-@register(3, x="omega off the middle axis, relative", error="error of the time of the first flip, relative")
+@register(3, error="error of the time of the first flip, relative")
 def intermediate_axis(result: CaseResult, quick: bool) -> None:
     """Spin about the middle axis, off by 1e-3 to 1e-12: the time of the first flip agrees with theory; many follow.
 
@@ -160,7 +160,7 @@ def intermediate_axis(result: CaseResult, quick: bool) -> None:
             span = 10 * max(first, log(1e8) / rate)
             data = free((i1, i2, i3), (off, 1.0, 0.0))
             outcome = run_body(data, 0.02, span, family, first_flip_error, samples=int(span / 0.1))
-            result.add(f"off by {off:.0e}: {len(times)} flips", outcome, 3e-3, family, off, 0.02)
+            result.add(f"off by {off:.0e}: {len(times)} flips", outcome, 3e-3, family, 0.02)
 
 
 def quarter_period(off: float, i1: float, i2: float, i3: float) -> float:
@@ -174,7 +174,7 @@ def quarter_period(off: float, i1: float, i2: float, i3: float) -> float:
     return float(ellipkm1(i1 * (i3 - i1) * off**2 / excess) / rate)
 
 
-@register(4, x="|omega| dt (rad)", error="error of Q; of the invariants with the split rotor")
+@register(4, error="error of Q; of the invariants with the split rotor")
 def fast_spin(result: CaseResult, quick: bool) -> None:
     """Steps that rotate the body by 0.1 to 1000 rad: the exact rotor keeps Q, the split one |L| and QᵀQ."""
     inertia, omega = np.array([1.0, 1.7, 2.4]), np.array([0.6, 0.64, 0.48])
@@ -186,10 +186,10 @@ def fast_spin(result: CaseResult, quick: bool) -> None:
             error = invariants_error if family == SPLIT else rotation_error(truth)
             # the error of DOP853 itself is about 1e-13 per radian
             outcome = run_body(data, angle, span, family, error)
-            result.add(f"{angle:g} rad per step", outcome, 1e-12 * max(span, 100.0), family, angle, angle)
+            result.add(f"{angle:g} rad per step", outcome, 1e-12 * max(span, 100.0), family, angle)
 
 
-@register(12, x="steps", error="error of |L|, relative")
+@register(12, error="error of |L|, relative")
 def long_run(result: CaseResult, quick: bool) -> None:
     """One body for 1e8 steps: growth of the errors of |L|, of QᵀQ and of the energy.
 
@@ -206,7 +206,7 @@ def long_run(result: CaseResult, quick: bool) -> None:
             return np.abs(results["L_size_error"]).max()
 
         outcome = run_body(free((1.0, 1.7, 2.4)), step, steps * step, family, errors, samples=2000)
-        result.add(f"{steps:.0e} steps", outcome, 1e-15 * steps**0.75, family, steps, step)
+        result.add(f"{steps:.0e} steps", outcome, 1e-15 * steps**0.75, family, step)
         for name, symbol in (("L_size_error", "|L|"), ("orthogonality_error", "QᵀQ"), ("energy_error", "energy")):
             if kept:
                 result.notes.append(f"{family}, {symbol}: {describe_growth(kept[name])}")
@@ -237,7 +237,7 @@ SWING = 0.1 * 15 * 9.81 / 5435.7
 CENTRE_AT_HALF = np.array([-0.7024682970565856, -0.02116518470192333, -0.7114002576517344])
 
 
-@register(5, x="step (s)", error="error of the centre of mass after 0.5 s (m)")
+@register(5, error="error of the centre of mass after 0.5 s (m)")
 def fast_heavy_top(result: CaseResult, quick: bool) -> None:
     """The fast heavy top through its near-vertical pass, within 2.6e-13 of straight down."""
 
@@ -246,7 +246,7 @@ def fast_heavy_top(result: CaseResult, quick: bool) -> None:
 
     for family in families(quick):
         outcome = run_body(FAST_TOP, 1e-4, 0.5, family, centre_error)
-        result.add("half a second", outcome, 1e-7 if family in (SPLIT, EXACT) else 1e-10, family, 1e-4, 1e-4)
+        result.add("half a second", outcome, 1e-7 if family in (SPLIT, EXACT) else 1e-10, family, 1e-4)
         run = lambda step, family=family: run_body(FAST_TOP, step, 400 * step, family, centre_error, 400)  # noqa: E731
         result.limits.append(longest_step(run, 1e-3, "", family, SWING))
 
@@ -260,7 +260,7 @@ UPRIGHT = {
 NUDGE = 1e-9
 
 
-@register(5, x="distance from the threshold of sleep, relative", error="log of the largest tilt, against theory")
+@register(5, error="log of the largest tilt, against theory")
 def sleeping_top(result: CaseResult, quick: bool) -> None:
     """The sleeping top at 1 +- 1e-6 (and more) of its threshold: it falls below, and stays upright above.
 
@@ -276,7 +276,7 @@ def sleeping_top(result: CaseResult, quick: bool) -> None:
             step = (0.02 if quick else 0.1) * abs(gap) ** 0.5 if family.startswith(SPLIT) else 0.05
             tilt = lambda results, known=known: abs(np.log(results["theta"].max() / known))  # noqa: E731
             outcome = run_body(data, step, span, family, tilt, samples=2000)
-            result.add(f"1 {gap:+.0e}", outcome, 0.05, family, abs(gap), step)
+            result.add(f"1 {gap:+.0e}", outcome, 0.05, family, step)
 
 
 @register(5, error="error of Q")
@@ -292,7 +292,7 @@ def poles(result: CaseResult, quick: bool) -> None:
             expected = (RIGHT, REFUSED) if "euler" in family else (RIGHT,)
             allowed = 1e-11 if family not in TEXTBOOK else 1e-6
             outcome = run_body(data, 0.01, span, family, rotation_error(truth))
-            result.add(f"theta = {theta:g}°", outcome, allowed, family, theta, 0.01, expected)
+            result.add(f"theta = {theta:g}°", outcome, allowed, family, 0.01, expected)
 
 
 DECAY_STEPS = 20
@@ -314,7 +314,7 @@ def decay(column: str, known: np.ndarray):
     return error
 
 
-@register(6, x="c dt / I", error="error of omega, relative; infinite if it overshoots")
+@register(6, error="error of omega, relative; infinite if it overshoots")
 def friction(result: CaseResult, quick: bool) -> None:
     """Viscous and dry friction with c dt / I from 1e-12 to 1e6: exact decay, never past zero."""
     at = np.arange(DECAY_STEPS + 1.0)
@@ -326,10 +326,10 @@ def friction(result: CaseResult, quick: bool) -> None:
         for family in (SPLIT, EXACT):  # srkn_4 would be of order 2 with resistance, so scenes refuse it
             for setting, data, known in (("viscous", viscous, np.exp(-c * at)), ("dry", dry, known_dry)):
                 outcome = run_body(data, 1.0, DECAY_STEPS, family, decay("omega_body_3", known), DECAY_STEPS)
-                result.add(f"{setting}, {c:.0e}", outcome, 1e-14 * DECAY_STEPS, family, c, 1.0)
+                result.add(f"{setting}, {c:.0e}", outcome, 1e-14 * DECAY_STEPS, family, 1.0)
 
 
-@register(6, x="c dt / m", error="error of v, relative; infinite if it overshoots")
+@register(6, error="error of v, relative; infinite if it overshoots")
 def fluid(result: CaseResult, quick: bool) -> None:
     """Linear resistance with c dt / m from 1e-12 to 1e6: exact decay and fall; quadratic: never past zero."""
     at = np.arange(DECAY_STEPS + 1.0)
@@ -343,10 +343,10 @@ def fluid(result: CaseResult, quick: bool) -> None:
             ("quadratic", quadratic, 1 / (1 + c * at), max(1e-13, 0.1 * min(c * c, 5.0))),
         ):
             outcome = run_body(data, 1.0, DECAY_STEPS, POINT, decay("vx", known), DECAY_STEPS)
-            result.add(f"{setting}, {c:.0e}", outcome, allowed, SPLIT, c, 1.0)
+            result.add(f"{setting}, {c:.0e}", outcome, allowed, SPLIT, 1.0)
         falling = {"body": {"mass_kg": 1.0}, "gravity": {}, "fluid": {"linear_resistance_kg_s": [c] * 3}}
         speed = 9.81 * expm1(-c * DECAY_STEPS) / c
         fall = lambda results, speed=speed: abs(results["vz"][-1] / speed - 1)  # noqa: E731
         # kick, drift, kick are exact for a constant force
         outcome = run_body(falling, 1.0, DECAY_STEPS, POINT, fall, DECAY_STEPS)
-        result.add(f"falling, {c:.0e}", outcome, 1e-13, SPLIT, c, 1.0)
+        result.add(f"falling, {c:.0e}", outcome, 1e-13, SPLIT, 1.0)

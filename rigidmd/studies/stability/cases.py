@@ -47,7 +47,6 @@ class CaseRun:
 
     setting: str  # describes what was varied
     family: str
-    x: float  # the same as a number for the figure
     step: float
     allowed: float  # largest error
     expected: tuple[str, ...]
@@ -74,7 +73,7 @@ class StepLimit(NamedTuple):
     beyond: str  # drift, blow-up, detected, undetected, crash; empty where nothing fails
     message: str
     seconds: float
-    curve: tuple[tuple[float, float], ...]  # (step, error that the run reported), by step
+    tried: float  # the longest step that was tried
 
 
 #: run(result, quick) adds runs and step limits to the result; quick : fewer settings and integrators.
@@ -88,20 +87,18 @@ class CaseResult:
     name: str
     group: int  # number of its kind of difficulty, from 1 to 14
     sentence: str
-    x_title: str = ""
-    error_title: str = ""
+    error_title: str = ""  # what its error is
     step_unit: str = ""
     run: CaseFunction = lambda result, quick: None
     runs: list[CaseRun] = field(default_factory=list)
     limits: list[StepLimit] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    seconds: float = nan
 
     def add(
-        self, setting: str, outcome: Outcome, allowed: float = nan, family: str = "", x: float = nan, step: float = nan,
+        self, setting: str, outcome: Outcome, allowed: float = nan, family: str = "", step: float = nan,
         expected: tuple[str, ...] = (RIGHT,),
     ) -> None:  # fmt: skip
-        self.runs.append(CaseRun(setting, family, x, step, allowed, expected, outcome))
+        self.runs.append(CaseRun(setting, family, step, allowed, expected, outcome))
 
     @property
     def families(self) -> list[str]:
@@ -166,20 +163,19 @@ def longest_step(
         order = (CRASH, UNDETECTED, "blow-up", "drift", "detected")
         beyond = next(way for way in order if way in ways)
         message = ways[beyond].crash or ways[beyond].message
-    curve = tuple(sorted((step, outcome.reported_error) for step, outcome in seen.items()))
     seconds = sum(outcome.seconds for outcome in seen.values())
-    return StepLimit(setting, family, inf if bad == inf else good, beyond, message, seconds, curve)
+    return StepLimit(setting, family, inf if bad == inf else good, beyond, message, seconds, max(seen))
 
 
 CASES: dict[str, CaseResult] = {}  # without results
 
 
-def register(group: int, x: str = "", error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
+def register(group: int, error: str = "", step: str = "s") -> Callable[[CaseFunction], CaseFunction]:
     """Register a function as a case under its own name, with the first line of its docstring."""
 
     def add(run: CaseFunction) -> CaseFunction:
         sentence = (run.__doc__ or "").strip().splitlines()[0].rstrip(".")
-        CASES[run.__name__] = CaseResult(run.__name__, group, sentence, x, error, step, run)
+        CASES[run.__name__] = CaseResult(run.__name__, group, sentence, error, step, run)
         return run
 
     return add

@@ -1,28 +1,24 @@
 """`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv and a page."""
 
 import html
-import time as clock
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import inf, isfinite, isnan
 from pathlib import Path
 
-import numpy as np
-
+from rigidmd.core.files import write_text
 from rigidmd.errors import SceneError
-from rigidmd.figures.style import INK, curve_style, label_minor_ticks, new_figure, open_axis
 from rigidmd.io.write import columns_text, format_cell, write_csv
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.stability import bodies, molecules, water  # noqa: F401  (cases)
-from rigidmd.studies.stability.cases import BOUND, CASES, CRASH, RIGHT, UNDETECTED, VERDICTS, CaseResult
-from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table, wide, write_page
+from rigidmd.studies.stability.cases import BOUND, CASES, CRASH, UNDETECTED, VERDICTS, CaseResult
+from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, items, page, plain, section, table
 
 FILES = ("stability.csv", "stability.html")
 HEADERS = ("case", "integrator", "runs", "verdicts", "largest error", "of allowed", "longest step", "beyond", "seconds")
 KINDS = dict(zip(VERDICTS, (GOOD, GOOD, DOUBTFUL, BAD, BAD), strict=True))  # how a verdict is shown
 MESSAGES = 3  # messages of a case at most
-FLOOR = 1e-17  # errors of exactly 0 are drawn here
 
 
 def selected_cases(names: list[str] | None) -> list[CaseResult]:
@@ -41,9 +37,7 @@ def run_cases(
     for k, case in enumerate(cases):
         progress(k / len(cases), case.name)
         result = replace(case, runs=[], limits=[], notes=[])
-        began = clock.perf_counter()
         case.run(result, quick)
-        result.seconds = clock.perf_counter() - began
         yield result
 
 
@@ -59,7 +53,7 @@ def _row(result: CaseResult, family: str) -> list[str]:
     seconds = sum(t.outcome.seconds for t in runs) + sum(limit.seconds for limit in limits)
     longest = "-"
     if least:
-        limit = least.longest if least.longest < inf else max(step for step, _ in least.curve)
+        limit = least.longest if least.longest < inf else least.tried
         longest = f"{'' if least.longest < inf else '> '}{format_cell(limit)} {result.step_unit}"
     return [
         result.name, family or "-", str(len(runs)), ", ".join(f"{verdicts[v]} {v}" for v in VERDICTS if verdicts[v]),
@@ -112,71 +106,11 @@ def write_stability(folder: Path, results: list[CaseResult], command: str, machi
         ]  # fmt: skip
     cells = [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
     write_csv(folder / FILES[0], [titles, *cells])
-    write_page(folder / FILES[1], lambda: stability_page(results, command, machine))
-    return [folder / name for name in FILES if (folder / name).is_file()]
-
-
-def case_figure(result: CaseResult, styles: dict[str, dict] | None = None):
-    """A small figure of a case: errors over the varied quantity, and of conserved quantities over the step.
-
-    styles : integrator -> colour and marker; None without numbers
-    """
-    styles = styles or styles_of([result])
-    varied = len({t.x for t in result.runs if isfinite(t.x) and isfinite(t.outcome.error)}) > 1
-    panels = [kind for kind, has in (("runs", varied), ("limits", result.limits)) if has]
-    if not panels:
-        return None
-    figure = new_figure(4.6 * len(panels), 3.0)
-    for axis, kind in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
-        for family in result.families:
-            (_draw_runs if kind == "runs" else _draw_limits)(axis, result, family, styles[family])
-        at = np.concatenate([line.get_xdata() for line in axis.get_lines()])
-        low, high = at.min(initial=inf), at.max(initial=0)
-        axis.set_xscale("log" if low > 0 and high > 20 * low else "linear")
-        axis.set_yscale("log")
-        open_axis(axis, labelsize=7, which="both")
-        for line in (axis.xaxis, axis.yaxis):
-            line.label.set(size=8, color=INK)
-            if line.get_scale() == "log":
-                label_minor_ticks(line)
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(frameon=False, fontsize=6.5, loc="upper left", bbox_to_anchor=(1.0, 1.0), labelcolor=INK)
-    return figure
-
-
-def styles_of(results: list[CaseResult]) -> dict[str, dict]:
-    """Colour and marker of each integrator, the same in all figures."""
-    names = dict.fromkeys(family for result in results for family in result.families)
-    return {name: {key: curve_style(k)[key] for key in ("color", "marker")} for k, name in enumerate(names)}
-
-
-def _draw_runs(axis, result: CaseResult, family: str, style: dict) -> None:
-    runs = sorted((t for t in result.runs if t.family == family and isfinite(t.x)), key=lambda t: t.x)
-    right = [t for t in runs if t.verdict == RIGHT]
-    wrong = [t for t in runs if t.verdict != RIGHT and isfinite(t.outcome.error)]
-    hollow = {"ls": "none", "ms": 5, "mfc": "none", "label": family or None, **style}
-    axis.plot([t.x for t in right], [max(t.outcome.error, FLOOR) for t in right], **hollow)
-    color = style["color"]
-    axis.plot([t.x for t in wrong], [max(t.outcome.error, FLOOR) for t in wrong], "x", ms=6, color=color)
-    bound = [t for t in runs if t.allowed > 0 and isfinite(t.allowed) and isfinite(t.outcome.error)]
-    axis.plot([t.x for t in bound], [t.allowed for t in bound], "_", ms=6, color=color, alpha=0.6)
-    axis.set_xlabel(result.x_title)
-    axis.set_ylabel(result.error_title + "\n(dashes: allowed)")
-
-
-def _draw_limits(axis, result: CaseResult, family: str, style: dict) -> None:
-    for n, limit in enumerate(one for one in result.limits if one.family == family):
-        points = [(step, min(max(error, FLOOR), 1e6)) for step, error in limit.curve if not isnan(error)]
-        if points:
-            axis.plot(*zip(*points, strict=True), lw=0.9, ms=3, label=None if n else family, **style)
-        if isfinite(limit.longest) and limit.longest > 0:
-            axis.axvline(limit.longest, color=style["color"], lw=0.6, ls=":")
-    axis.set_xlabel(f"step ({result.step_unit}); dotted: longest bounded")
-    axis.set_ylabel("largest error of a conserved quantity")
+    write_text(folder / FILES[1], stability_page(results, command, machine))
+    return [folder / name for name in FILES]
 
 
 def stability_page(results: list[CaseResult], command: str, machine: str) -> str:
-    styles = styles_of(results)
     links = {f.name: Raw(f'<a href="#case-{plain(f.name)}">{plain(f.name)}</a>') for f in results}
     glance = []
     for f in results:
@@ -190,7 +124,7 @@ def stability_page(results: list[CaseResult], command: str, machine: str) -> str
         items(conclusions(results)),
         section("At a glance", table(["case", *VERDICTS, ""], glance), table([], meanings, words=True)),
         section("All integrators", table(HEADERS, rows_of(results), marked=links), f"<p>{html.escape(bound)}</p>"),
-        *(_case(result, styles) for result in results),
+        *map(_case, results),
         section("How to repeat it", code(f"{command}    # on {machine}")),
     ]
     return page("Stability", parts)
@@ -200,12 +134,12 @@ def _badge(verdict: str, count: str = "") -> str:
     return f'<span class="badge {KINDS[verdict]}">{html.escape(f"{count} {verdict}".strip())}</span>'
 
 
-def _case(result: CaseResult, styles: dict[str, dict]) -> str:
+def _case(result: CaseResult) -> str:
     counts = Counter(t.verdict for t in result.runs)
     badges = " ".join(_badge(v, str(counts[v])) for v in VERDICTS if counts[v])
-    drawn = case_figure(result, styles)
-    shown = "" if drawn is None else wide(drawn, result.name, result.name)
     messages = dict.fromkeys(t.outcome.message for t in result.runs if t.outcome.message)
     notes = [*result.notes, *(Raw(f"<code>{plain(message)}</code>") for message in list(messages)[:MESSAGES])]
-    sentence = f"<p>{plain(result.sentence)}. {badges}</p>"
-    return section(result.name, sentence, shown, items(notes), anchor=f"case-{result.name}")
+    error = f"; errors: {plain(result.error_title)}" if result.error_title else ""
+    return section(
+        result.name, f"<p>{plain(result.sentence)}{error}. {badges}</p>", items(notes), anchor=f"case-{result.name}"
+    )
