@@ -285,7 +285,6 @@ def test_times_of_the_command_line_are_finite(until, capsys):
     [
         (["--span", "nan"], "must be finite and greater than 0"),
         (["--timesteps", "1,inf"], "must be finite and greater than 0"),
-        (["--averages", "nan"], "must be finite and greater than 0"),
     ],
 )
 def test_times_of_accuracy_are_finite(options, expected, capsys, tmp_path):

@@ -1,6 +1,5 @@
-"""`rigidmd accuracy`: errors of integrators against their run time; with --averages alone, the bias of averages."""
+"""`rigidmd accuracy`: errors of integrators against their run time; with --averages, the bias of averages."""
 
-from math import inf
 from pathlib import Path
 
 from rigidmd.commands.arguments import SCENE, Options, argument, command, output_folder, read_scene, write_study
@@ -21,14 +20,13 @@ from rigidmd.commands.arguments import SCENE, Options, argument, command, output
     argument("--timesteps", metavar="X,Y,...", help="time steps, fs for molecules, s for a body"),
     argument("--span", type=float, metavar="T", help="length of each run (default: 0.1 ps; a body's run)"),
     argument("--repeats", type=int, default=3, metavar="N", help="timings of each run (default: 3); 1 shows no spread"),
-    argument("--averages", type=float, metavar="PS", nargs="?", const=inf,
-        help="molecules only. With PS: also average temperatures, energy and pressure over that time with every step, "
-        "at constant energy. Without PS: only measure the bias of averages: sample the last stage under its thermostat "
+    argument("--averages", action="store_true",
+        help="molecules only: measure the bias of averages instead, by samples of the last stage under its thermostat "
         "(nvt, npt) with every integrator at every step. --integrators then accepts names with a thermostat, "
         "baoab+langevin (default: the method of the stage, baoab+langevin, velocity_verlet+velocity_rescaling, "
         "velocity_verlet+nose_hoover), and --timesteps default to fractions of the longest stable one"),
     argument("--sample-ps", type=float, metavar="PS",
-        help="with --averages alone: time sampled with every step, after a fifth of it (default: 20)"),
+        help="with --averages: time sampled with every step, after a fifth of it (default: 20)"),
     *output_folder("runs/NAME-accuracy"), writes=True,
 )  # fmt: skip
 def _accuracy(options: Options) -> int:
@@ -44,7 +42,7 @@ def _accuracy(options: Options) -> int:
         timesteps = [float(text) for text in options.timesteps.split(",")] if options.timesteps else None
     except ValueError:
         raise SceneError("--timesteps", [f"{options.timesteps!r} is not a list of numbers such as 1,2,4"]) from None
-    if options.averages == inf:
+    if options.averages:
         sample = SAMPLE_PS if options.sample_ps is None else options.sample_ps
         write_study(
             folder, options.force, averages_report.FILES, "compiling, and running what comes before the last stage",
@@ -54,11 +52,10 @@ def _accuracy(options: Options) -> int:
         )  # fmt: skip
         return 0
     if options.sample_ps is not None:
-        raise SceneError("--sample-ps", ["it needs --averages without a PS"])
-    settings = integrators, timesteps, options.span, options.repeats, options.averages
+        raise SceneError("--sample-ps", ["it needs --averages"])
     write_study(
         folder, options.force, report.FILES, "compiling and running the reference",
-        lambda progress: measure_accuracy(scene, *settings, progress),
+        lambda progress: measure_accuracy(scene, integrators, timesteps, options.span, options.repeats, progress),
         lambda found: [*report.recommendations(found), "", report.table_text(found)],
         report.write_accuracy,
     )  # fmt: skip

@@ -27,7 +27,7 @@ AT_A_POLE = "the start has theta = 0 or 180 degrees, where Euler angles are sing
 
 def measure_accuracy(
     scene: MolecularScene | BodyScene, integrators: list[str] | None = None, timesteps: list[float] | None = None,
-    span: float | None = None, repeats: int = 3, averages: float | None = None,
+    span: float | None = None, repeats: int = 3,
     progress: Callable[[float], object] = lambda fraction: None,
 ) -> IntegratorAccuracy:  # fmt: skip
     """Error against run time of integrators at time steps, on the start of a scene. Raises SceneError.
@@ -36,7 +36,6 @@ def measure_accuracy(
         radau use the scene's formulation, or matrix; a suffix _matrix, _quaternion or _euler_angles sets another
     timesteps : fs for molecules, s for a body, the same for all; default: steps of equal cost around the scene's
     span : ps or s
-    averages : ps over which temperatures, energy and pressure of molecules are also averaged
     progress : called with the fraction that is done; at 0, after all arguments have been checked
 
     Molecules start where the last stage starts, after the earlier stages have run; no thermostat acts.
@@ -48,9 +47,9 @@ def measure_accuracy(
         of_all = f"(known: {', '.join(known)})"
         errors = [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
         raise SceneError("--integrators", errors)
-    lengths = [*(timesteps or []), *(length for length in (span, averages) if length is not None)]
+    lengths = [*(timesteps or []), *([] if span is None else [span])]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
-        raise SceneError("accuracy", ["time steps, span, averages and repeats must be finite and greater than 0"])
+        raise SceneError("accuracy", ["time steps, span and repeats must be finite and greater than 0"])
     if isinstance(scene, MolecularScene) and (refused := [name for name in integrators if name in COMPARATORS]):
         reasons = [f"{name} does not suit this scene: it is for single bodies" for name in refused]
         raise SceneError(scene.source, reasons)
@@ -62,8 +61,6 @@ def measure_accuracy(
         base = RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations
     else:
         trial_system, base = _of_molecules(scene, span)
-    if averages and trial_system.observe is None:
-        raise SceneError(scene.source, ["--averages is for molecules in a box"])
     if refused := [name for name in integrators if name not in trial_system.methods]:
         reasons = [f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused]
         raise SceneError(scene.source, reasons)
@@ -80,7 +77,8 @@ def measure_accuracy(
         name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
     }
-    found = measure(trial_system, plan(trial_system, steps), repeats, averages, progress, not timesteps)
+    trials = plan(trial_system, steps)
+    found = measure(trial_system, trials, repeats, progress=progress, extend=not timesteps)
     found.left_out = left_out
     return found
 

@@ -290,10 +290,8 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
     """The last stage. Raises SceneError unless it has a thermostat at one temperature."""
     stage = scene.stages[-1]
     if not stage.has_thermostat:
-        error = (
-            f"--averages samples the last stage, and {stage.ensemble} has no thermostat: give it ensemble = 'nvt' or "
-            "'npt', or see --averages PS for averages at constant energy"
-        )
+        advice = "give it ensemble = 'nvt' or 'npt'"
+        error = f"--averages samples the last stage, and {stage.ensemble} has no thermostat: {advice}"
         raise SceneError(scene.source, [error])
     if len(set(stage.temperatures)) > 1 or (stage.has_barostat and stage.pressures[0] != stage.pressures[1]):
         error = "--averages needs one temperature and one pressure in the last stage; here they change"

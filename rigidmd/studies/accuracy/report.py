@@ -1,21 +1,18 @@
 """Report of `rigidmd accuracy`: a table, recommendations, accuracy.csv, .png and a self-contained page."""
 
 from collections.abc import Callable
-from math import hypot
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, new_figure, open_axis, write_figure
-from rigidmd.io.write import Column, Table, with_error
+from rigidmd.io.write import Column, Table
 from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
-FILES = ("accuracy.csv", "accuracy.png", "accuracy.html", "accuracy_averages.csv")
+FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
 DOUBTFUL = 0.2  # spread of repeated timings that causes a warning
-ESTIMATORS = {"": "on the steps", " half-step": "between the kicks", " unbiased": "unbiased"}
 
 
 def trial_table(found: IntegratorAccuracy) -> Table:
@@ -47,48 +44,9 @@ def trial_table(found: IntegratorAccuracy) -> Table:
     ], found.trials)  # fmt: skip
 
 
-def _bias(found: IntegratorAccuracy, trial: Trial, name: str) -> tuple[float, float] | None:
-    """Difference of an average from the trial with the smallest energy error, and its error; None for this trial."""
-    (value, error), (best, its_error) = trial.averages[name], found.most_exact.averages[name]
-    return None if trial is found.most_exact else (value - best, hypot(error, its_error))
-
-
-def averages_table(found: IntegratorAccuracy) -> Table:
-    """The averages of all trials that were sampled."""
-    columns = [Column("integrator", lambda t: t.integrator), Column("step (fs)", lambda t: t.timestep)]
-    for name in ("T_trans", "T_rot", "T_rot - T_trans"):
-        for kind, estimator in ESTIMATORS.items():
-            columns += with_error(f"{name} {estimator} (K)", lambda t, key=name + kind: t.averages.get(key))
-    for name, unit in (("potential", "kJ/mol"), ("pressure", "bar")):
-        columns += with_error(f"{name} ({unit})", lambda t, name=name: t.averages[name])
-        columns += with_error("bias", lambda t, name=name: _bias(found, t, name))
-    return Table(columns, [trial for trial in found.trials if trial.averages])
-
-
-def brief_averages_table(found: IntegratorAccuracy) -> Table:
-    """The averages that differ between steps, as text with their errors."""
-
-    def signed(measured: tuple[float, float] | None, missing: str = "-") -> str:
-        return format_signed(*measured) if measured else missing
-
-    name = "T_rot - T_trans"
-    titles = {kind: estimator if kind else f"{name} (K): {estimator}" for kind, estimator in ESTIMATORS.items()}
-    return Table([
-        Column("integrator", lambda t: t.integrator),
-        Column("step (fs)", lambda t: f"{t.timestep:.3g}"),
-        Column("T_trans (K)", lambda t: signed(t.averages["T_trans"]).lstrip("+")),
-        *(Column(title, lambda t, key=name + kind: signed(t.averages.get(key))) for kind, title in titles.items()),
-        Column("bias of U (kJ/mol)", lambda t: signed(_bias(found, t, "potential"), "(reference)")),
-        Column("bias of P (bar)", lambda t: signed(_bias(found, t, "pressure"), "(reference)")),
-    ], [trial for trial in found.trials if trial.averages])  # fmt: skip
-
-
 def table_text(found: IntegratorAccuracy) -> str:
     text = "errors of Q, X, the energy (rms, drift over the span) and other conserved quantities\n"
-    text += trial_table(found).text()
-    if found.sampled and any(trial.averages for trial in found.trials):
-        text += f"\n\naverages over {found.sampled:g} ps\n{brief_averages_table(found).text()}"
-    return text
+    return text + trial_table(found).text()
 
 
 def recommendations(found: IntegratorAccuracy) -> list[str]:
@@ -118,14 +76,7 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
         lines += [f"{name}: {failure}" for failure in dict.fromkeys(failures) if failure != "diverges"][:1]
     for why in dict.fromkeys(found.left_out.values()):
         lines.append(f"left out: {', '.join(name for name in found.left_out if found.left_out[name] == why)}: {why}")
-    lines += _describe_timings(found)
-    name = "T_rot - T_trans"
-    if found.sampled and (verlet := [t for t in found.trials if f"{name} unbiased" in t.averages]):
-        longest = max(verlet, key=lambda t: t.timestep)
-        on, unbiased = (format_signed(*longest.averages[name + kind]) for kind in ("", " unbiased"))
-        at = f"velocity_verlet at {longest.timestep:.3g} fs"
-        lines.append(f"{at}: {name} is {on} K on the steps, {unbiased} unbiased")
-    return lines
+    return lines + _describe_timings(found)
 
 
 def _describe_timings(found: IntegratorAccuracy) -> list[str]:
@@ -212,12 +163,10 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
 
 def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> list[Path]:
     trial_table(found).write(folder / FILES[0])
-    if (averages := averages_table(found)).rows:
-        averages.write(folder / FILES[3])
     title = f"{found.trial_system.name}: error against run time"
     write_figure(folder / FILES[1], lambda: accuracy_figure(found), title)
     write_page(folder / FILES[2], lambda: accuracy_page(found, command))
-    return [folder / name for name in FILES if (folder / name).is_file() and (name != FILES[3] or averages.rows)]
+    return [folder / name for name in FILES if (folder / name).is_file()]
 
 
 def _label_steps(axis, points: list[tuple[float, float, float]]) -> None:
@@ -289,9 +238,6 @@ def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
         section("Recommendations", table(titles, rows), items(remarks(found))),
         section("Error against run time", wide(accuracy_figure(found), "accuracy", "log error over log run time")),
         section("All trials", table(*trial_table(found).shown(), marked=colored)),
+        section("How to repeat it", code(command)),
     ]
-    if any(trial.averages for trial in found.trials):
-        averages = table(*brief_averages_table(found).shown(), marked=colored)
-        parts.append(section(f"Averages over {found.sampled:g} ps", averages))
-    parts.append(section("How to repeat it", code(command)))
     return page(f"{found.trial_system.name}: error against run time", parts)
