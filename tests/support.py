@@ -270,7 +270,7 @@ HOMES = {
     "run.pilot.trial_systems": "COMPARATORS _fit_step body_trial_system molecular_trial_system",
     "run.rigid_fit": "kinds_of",
     "figures.run": "energy_figure",
-    "analysis.files": "ANALYSIS AnalysisRequest analyse_folder read_results",
+    "analysis.files": "ANALYSIS analyse_folder read_results",
     "analysis.built_in.transport": "MPA_S NM2_PER_S correlation diffusion msd squared_displacement viscosity",
     "studies.sweep.replicas": "over_replicas",
     "analysis.built_in.structure": "density_profile hydrogen_bonds rdf structure_factor",

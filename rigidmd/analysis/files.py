@@ -4,6 +4,7 @@
 import csv
 import re
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -52,7 +53,7 @@ def write_results(
     entries, curves = dict(known), [curve for result in results for curve in result.curves]
     for result in [*results, *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items())]:
         entries[result.name] = {
-            "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
+            "about": result.about, "values": [asdict(value) for value in result.values], "notes": result.notes,
             "curves": [{key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves],
             "files": files.get(result.name, []), "stretch": frames_used,
         }  # fmt: skip
@@ -81,15 +82,6 @@ class _Curve(BaseModel):
     bars: bool
 
 
-class _Value(BaseModel):
-    name: str
-    unit: str
-    value: Bounded | None
-    error: Bounded | None
-    correlation_ps: Bounded | None = None
-    note: str = ""
-
-
 class _FramesUsed(BaseModel):
     model_config = ConfigDict(extra="allow")
 
@@ -102,7 +94,7 @@ class _FramesUsed(BaseModel):
 
 class _Entry(BaseModel):
     about: str
-    values: list[_Value]
+    values: list[Value]
     notes: list[str]
     curves: list[_Curve]
     files: list[str]
@@ -178,14 +170,6 @@ def curve_figure(curve: Curve):
 READING = 0.25  # fraction of the progress for reading frames
 
 
-class AnalysisRequest(NamedTuple):
-    """Names of analyses (all if empty), start (ps) and viscosity (mPa s), or None."""
-
-    names: list[str]
-    start: float | None = None
-    viscosity: float | None = None
-
-
 class AnalysisOutput(NamedTuple):
     """failed : analysis -> why it has failed, if it was not requested by name; frames_used : for analysis.json"""
 
@@ -196,27 +180,28 @@ class AnalysisOutput(NamedTuple):
 
 
 def analyse_folder(
-    folder: Path, request: AnalysisRequest, progress: Callable[[float, str], object] = lambda fraction, name: None
-) -> AnalysisOutput:
+    folder: Path, names: list[str], start: float | None = None, viscosity: float | None = None,
+    progress: Callable[[float, str], object] = lambda fraction, name: None,
+) -> AnalysisOutput:  # fmt: skip
     """Analyse the run in a folder and write the files into it. Raises OutputError.
 
     An analysis that is not possible is left out with a sentence, unless it was requested by name.
 
+    names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
     progress : called with the fraction done and the name of the present work
     """
-    entries = selected(request.names)
+    entries = selected(names)
     reading = lambda fraction: progress(READING * fraction, "reading frames")  # noqa: E731
     reading(0.0)
-    frames = frames_of_folder(read_record(folder), request.start, reading)
+    frames = frames_of_folder(read_record(folder), start, reading)
     results, failed = [], {}
     for k, entry in enumerate(entries):
         progress(READING + (1 - READING) * k / len(entries), entry.name)
-        options = {"viscosity_mPa_s": request.viscosity}
-        taken = options.keys() & signature(entry.function).parameters
+        takes_viscosity = "viscosity_mPa_s" in signature(entry.function).parameters
         try:
-            results.append(entry.function(frames, **{option: options[option] for option in taken}))
+            results.append(entry.function(frames, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {}))
         except OutputError as error:
-            if request.names:
+            if names:
                 raise OutputError(f"{folder}: {error}") from None
             failed[entry.name] = str(error)
     if not results:

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import NamedTuple
 
 import numpy as np
 
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.core.statistics import error_of_mean, format_with_error
+from rigidmd.io.run_files import Bounded
 from rigidmd.run.rigid_fit import Kind
 
 #: Blocks of frames whose scatter gives errors. The error of an error is one third.
@@ -20,7 +20,8 @@ MIN_CORRELATION_TIMES = 20.0
 Measured = tuple[np.ndarray, np.ndarray]  # an array and its standard error
 
 
-class Value(NamedTuple):
+@dataclass(frozen=True)
+class Value:
     """A value with its standard error, or a note on why there is none.
 
     correlation_ps : correlation time of the data
@@ -28,9 +29,9 @@ class Value(NamedTuple):
 
     name: str
     unit: str
-    value: float | None
-    error: float | None
-    correlation_ps: float | None = None
+    value: Bounded | None
+    error: Bounded | None
+    correlation_ps: Bounded | None = None
     note: str = ""
 
     def __str__(self) -> str:

@@ -32,7 +32,7 @@ class _List(argparse.Action):
     scene="this run", writes=True,
 )  # fmt: skip
 def _analyse(options: Options) -> int:
-    from rigidmd.analysis.files import AnalysisRequest, analyse_folder
+    from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.studies.sweep.folder import is_sweep
     from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
@@ -40,10 +40,9 @@ def _analyse(options: Options) -> int:
     for path in options.trust:
         run_user_file(Path(path))
     with progress_bar() as progress:
-        request = AnalysisRequest(options.only, options.start, options.viscosity)
-        folder = Path(options.folder)
+        folder, request = Path(options.folder), (options.only, options.start, options.viscosity)
         if is_sweep(folder):
-            found = analyse_sweep(folder, request, progress)
+            found = analyse_sweep(folder, *request, progress)
             progress(1.0, "")
             for of in found:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
@@ -52,7 +51,7 @@ def _analyse(options: Options) -> int:
                 print()
             print(f"values of all in {folder / ANALYSES}")
             return 0
-        done = analyse_folder(folder, request, progress)
+        done = analyse_folder(folder, *request, progress)
     used = done.frames_used
     print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")
     for note in used["notes"]:

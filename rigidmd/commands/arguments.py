@@ -161,10 +161,6 @@ def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) 
     return folder / default
 
 
-def command_line() -> str:
-    return shlex.join(["rigidmd", *sys.argv[1:]])
-
-
 def write_study(
     folder: Path, force: bool, files: tuple[str, ...], begins: str, measure: Callable[[Callable], Any],
     describe: Callable[[Any], list[str]], write: Callable[[Path, Any, str], list[Path]],
@@ -181,7 +177,7 @@ def write_study(
             found = measure(progress)
         print(*describe(found), sep="\n")
         make_folder(folder, files, lock)
-        written = write(folder, found, command_line())
+        written = write(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
     print(f"\n  files in {folder}: {', '.join(path.name for path in written)}")
     return found
 

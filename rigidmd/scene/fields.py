@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import Field, Strict, field_validator
 
 from rigidmd.scene.forces import ELECTROSTATICS
-from rigidmd.scene.species import ResidueNumber, checked_numbers, spans
+from rigidmd.scene.species import Numbers, spans
 from rigidmd.scene.validation import MOST_TABLES, NonNegative, Number, Positive, Section, Vector
 
 if TYPE_CHECKING:
@@ -72,17 +72,12 @@ class Restraint(Section):
 
     species: str | None = None
     """Species that is restrained; required if there are several"""
-    molecules: tuple[ResidueNumber, ...] | str | None = None
+    molecules: Numbers | None = None
     """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default: all"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
     """Stiffness; three numbers for x, y, z"""
     position_A: Vector | None = None
     """Position to which all are restrained; default: the position of each at the start"""
-
-    @field_validator("molecules")
-    @classmethod
-    def _are_numbers(cls, molecules: tuple[int, ...] | str | None):
-        return None if molecules is None else checked_numbers(molecules)
 
     @field_validator("stiffness_kJ_mol_A2")
     @classmethod

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
 
 from rigidmd.io.formats import extensions
 from rigidmd.scene.models import Site, SiteName, model_error
@@ -15,7 +15,29 @@ from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, S
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
 
+
+def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
+    """Numbers of molecules, [1, 2, 5] or "1-10, 15", unchanged. Raises ValueError."""
+    if numbers == ():
+        raise ValueError("is empty: list the numbers of molecules, or omit it")
+    if isinstance(numbers, str):
+        if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
+            raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
+        if reversed_ := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
+            raise ValueError(f"is {numbers!r}: {', '.join(reversed_)} ends before it begins")
+    return numbers
+
+
+def spans(numbers: tuple[int, ...] | str) -> list[tuple[int, int]]:
+    """Ranges (first, last) of "1-10, 15", or of the single numbers of a list."""
+    if not isinstance(numbers, str):
+        return [(number, number) for number in numbers]
+    ends = [[int(number) for number in part.split("-")] for part in numbers.split(",")]
+    return [(of_part[0], of_part[-1]) for of_part in ends]
+
+
 ResidueNumber = Annotated[int, Strict(), Field(ge=0)]
+Numbers = Annotated[tuple[ResidueNumber, ...] | str, AfterValidator(checked_numbers)]
 
 
 class Molecules(Section):
@@ -38,15 +60,10 @@ class Molecules(Section):
     """Residue names of this species in structure files"""
     count: Count | None = None
     """Number of molecules; required without a structure file"""
-    frozen: Flag | tuple[ResidueNumber, ...] | str = False
+    frozen: Flag | Numbers = False
     """Molecules that do not move. They act on all others but not on each other. True for all, or numbers of some,
     [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a file or if its residues are not the
     molecules, 1, 2, ... within this species"""
-
-    @field_validator("frozen")
-    @classmethod
-    def _are_numbers(cls, frozen: bool | tuple[int, ...] | str):
-        return frozen if isinstance(frozen, bool) else checked_numbers(frozen)
 
     @property
     def frozen_spans(self) -> list[tuple[int, int]]:
@@ -83,26 +100,6 @@ class Molecules(Section):
     def label(self) -> str:
         """The name, else the name of the model or file."""
         return self.name or self.model or Path(self.file or "").stem
-
-
-def checked_numbers(numbers: tuple[int, ...] | str) -> tuple[int, ...] | str:
-    """Numbers of molecules, [1, 2, 5] or "1-10, 15", unchanged. Raises ValueError."""
-    if numbers == ():
-        raise ValueError("is empty: list the numbers of molecules, or omit it")
-    if isinstance(numbers, str):
-        if not re.fullmatch(r"\s*\d+\s*(-\s*\d+\s*)?(,\s*\d+\s*(-\s*\d+\s*)?)*", numbers):
-            raise ValueError(f"is {numbers!r}, must be numbers of molecules such as '1-10' or '1-10, 15'")
-        if reversed_ := [f"{first}-{last}" for first, last in spans(numbers) if first > last]:
-            raise ValueError(f"is {numbers!r}: {', '.join(reversed_)} ends before it begins")
-    return numbers
-
-
-def spans(numbers: tuple[int, ...] | str) -> list[tuple[int, int]]:
-    """Ranges (first, last) of "1-10, 15", or of the single numbers of a list."""
-    if not isinstance(numbers, str):
-        return [(number, number) for number in numbers]
-    ends = [[int(number) for number in part.split("-")] for part in numbers.split(",")]
-    return [(of_part[0], of_part[-1]) for of_part in ends]
 
 
 Angle = Annotated[float, Strict(), Field(gt=0, lt=180)]

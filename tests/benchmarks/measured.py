@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support import AnalysisRequest, analyse_folder
+from support import analyse_folder
 
 from rigidmd import Scene, Simulation
 
@@ -54,7 +54,7 @@ def main() -> None:
     only = options.only
     water = scene(options.model, options.count, options.density, options.duration, options.interval, only)
     Simulation(water, options.output).run(progress=True)
-    done = analyse_folder(options.output, AnalysisRequest(only))
+    done = analyse_folder(options.output, only)
     for told in [*done.frames_used["notes"], *done.results]:
         print(told)
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError
-from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, is_empty, offsets_of, written_by_runs
+from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
@@ -102,14 +102,6 @@ def read_manifest(folder: Path) -> Manifest:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write sweep.json as a whole. Raises OutputError."""
     write_json(folder / MANIFEST, asdict(manifest), indent=1)
-
-
-def check_free(folder: Path) -> None:
-    """Raise OutputError if a folder holds other files; changes nothing."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name another folder with -o")
-    if not is_empty(folder) and not is_sweep(folder):
-        raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
 
 
 def clear_sweep(folder: Path, names: Iterable[str]) -> None:

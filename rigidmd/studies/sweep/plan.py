@@ -180,7 +180,11 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
             scene = Scene.read(path, fixed | {key: value for first, value in values.items() for key in keys[first]})
             kind = json.dumps({key: value for key, value in values.items() if key != SEED}, default=str)
             if kind not in checked:
-                checked[kind] = _build_error(scene)
+                checked[kind] = None
+                try:
+                    resolve(scene)  # pyright: ignore[reportArgumentType]  (either kind)
+                except RigidMDError as error:
+                    checked[kind] = error
             if (build_error := checked[kind]) is not None:
                 raise build_error
         except RigidMDError as error:
@@ -225,15 +229,6 @@ class Digests:
         """SHA-256 of a scene, as it was read, and of all files that it reads."""
         text = json.dumps([scene_digest(scene), self.inputs(scene)], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _build_error(scene: MolecularScene | BodyScene) -> RigidMDError | None:
-    """The error that only building the system of a scene raises."""
-    try:
-        resolve(scene)  # pyright: ignore[reportArgumentType]  (either kind)
-    except RigidMDError as error:
-        return error
-    return None
 
 
 def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:

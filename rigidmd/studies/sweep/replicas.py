@@ -2,12 +2,13 @@
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.files import AnalysisOutput, AnalysisRequest, analyse_folder, write_results
+from rigidmd.analysis.files import AnalysisOutput, analyse_folder, write_results
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.files import writing
 from rigidmd.core.statistics import standard_error
@@ -34,11 +35,13 @@ class Combination(NamedTuple):
     files: list[Path]
 
 
-def analyse_sweep(folder: Path, request: AnalysisRequest, progress: Callable[..., object]) -> list[Combination]:
+def analyse_sweep(
+    folder: Path, names: list[str], start: float | None, viscosity: float | None, progress: Callable[..., object]
+) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
     Means over replicas are written into the folder of the sweep, or into a folder for each combination of the other
-    keys, and all values into analysis.csv. progress : called with the fraction that is done and what is being done
+    keys, and all values into analysis.csv. names, start, viscosity, progress : see `analyse_folder`
     """
     manifest = read_manifest(folder)
     ready = [point for point in manifest.points if state_on_disk(folder, point) == "finished"]
@@ -49,7 +52,7 @@ def analyse_sweep(folder: Path, request: AnalysisRequest, progress: Callable[...
     for k, point in enumerate(ready):
         try:
             done[point.folder] = analyse_folder(
-                folder / point.folder, request,
+                folder / point.folder, names, start, viscosity,
                 lambda part, name, k=k, point=point: progress((k + part) / len(ready), f"{point.folder} {name}"),
             )  # fmt: skip
         except OutputError as error:
@@ -119,7 +122,7 @@ def _mean_value(values: list[Value], runs: int) -> Value:
     there = [value.value for value in values if value.value is not None]
     if len(there) < 2:
         only = next((value for value in values if value.value is not None), values[0])
-        return only._replace(note=f"of one of {runs} runs") if there else only
+        return replace(only, note=f"of one of {runs} runs") if there else only
     note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
     mean, error = float(np.mean(there)), float(standard_error(there))
     return Value(values[0].name, values[0].unit, mean, error, None, note)

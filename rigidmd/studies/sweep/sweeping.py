@@ -16,14 +16,14 @@ from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.errors import OutputError, SceneError, SimulationError
-from rigidmd.io.folder import FolderLock, add_to_folder
+from rigidmd.io.folder import FolderLock, add_to_folder, is_empty
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
 from rigidmd.run.schedule import checked_walltime
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, Pool
-from rigidmd.studies.sweep.folder import FILES, SCRIPT, Manifest, SweepPoint, check_free, read_manifest, write_manifest
+from rigidmd.studies.sweep.folder import FILES, SCRIPT, Manifest, SweepPoint, is_sweep, read_manifest, write_manifest
 from rigidmd.studies.sweep.plan import Axis, axes_of, merge_manifests, order_axes, read_points, update_state, with_seeds
 from rigidmd.studies.sweep.table import Table, collect
 from rigidmd.studies.sweep.worker import PointResult, PointTask, Send, run_task
@@ -88,7 +88,10 @@ def open_sweep(
         raise SceneError("--trust", [f"{scene} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
     folder = folder or Path("runs") / f"{named or default_name(scene)}-sweep"
-    check_free(folder)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name another folder with -o")
+    if not is_empty(folder) and not is_sweep(folder):
+        raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
     fresh, is_body = read_points(scene, axes if force else order_axes(folder, axes))
     lock = stack.enter_context(FolderLock(folder))
     manifest = merge_manifests(folder, fresh, force)
