@@ -1,10 +1,20 @@
-"""`rigidmd run`; `resume` uses its options and its call."""
+"""`rigidmd run` and `rigidmd resume`."""
 
 import shlex
 from pathlib import Path
 
 from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene, seconds, time_ps
+from rigidmd.commands.arguments import (
+    SCENE,
+    TRUST,
+    Options,
+    add_engine,
+    argument,
+    command,
+    read_scene,
+    seconds,
+    time_ps,
+)
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
@@ -59,3 +69,17 @@ def run(options: Options) -> int:
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0
+
+
+@command(
+    40, "continue a run that was stopped", "rigidmd resume runs/water --until 200ps",
+    argument("folder", metavar="DIR", help="folder of the run"), TRUST, *DURATION,
+    overrides=[], force=False, resume=True, writes=True,
+)  # fmt: skip
+def _resume(options: Options) -> int:
+    from rigidmd.io.folder import SCENE, check_is_run
+
+    folder = Path(options.folder)
+    check_is_run(folder)
+    options.scene, options.output = str(folder / SCENE), options.folder
+    return run(options)
