@@ -361,7 +361,6 @@ HOMES = {
     "io.folder": "CHECKPOINT FINAL FolderLock LOG PREVIOUS check_folder",
     "view.molecule_figure": "models_table write_molecule_figure",
     "figures.picture": "Picture",
-    "studies.accuracy.report": "trial_table write_accuracy",
     "run.record": "read_record",
     "run.report": "summary_text",
     "io.run_files": "Summary TENSOR columns read_json",
@@ -386,7 +385,7 @@ HOMES = {
         "AverageRun AveragedQuantity Averages MeanAtStep extrapolate measure_averages start_of_last_stage "
     ),
     "studies.compare": "compare describe_run_comparison",
-    "studies.accuracy.accuracy": "measure_accuracy",
+    "studies.accuracy.accuracy": "measure_accuracy trial_table write_accuracy",
     "studies.stability.report": "run_cases selected_cases",
     "studies.stability.cases": (
         "CASES CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step"
@@ -408,8 +407,8 @@ RENAMED = {
     "lennard_jones_tail": "forces.potentials.lennard_jones:tail",
     "openmm_table": "engines.openmm.translations:TRANSLATIONS",
     "own_energy_and_force": "forces.potentials.custom:energy_and_force",
-    "accuracy_recommendations": "studies.accuracy.report:recommendations",
-    "accuracy_table": "studies.accuracy.report:table_text",
+    "accuracy_recommendations": "studies.accuracy.accuracy:recommendations",
+    "accuracy_table": "studies.accuracy.accuracy:table_text",
     "stability_table": "studies.stability.report:table_text",
     "stability_conclusions": "studies.stability.report:conclusions",
     "tree_ahead": "forces.neighbors.tree:ahead",
@@ -446,7 +445,7 @@ MODULES = {
     "molecule_film": "view.molecule_animation",
     "user_modules": "core.user_modules",
     "pair_loop": "forces.neighbors.pair_loop",
-    "accuracy_report": "studies.accuracy.report",
+    "accuracy_report": "studies.accuracy.accuracy",
     "progress": "io.progress",
     "provenance": "run.resume",
     "ramps": "dynamics.thermostats",

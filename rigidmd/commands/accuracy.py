@@ -31,8 +31,7 @@ from rigidmd.commands.arguments import SCENE, Options, argument, command, output
 )  # fmt: skip
 def _accuracy(options: Options) -> int:
     from rigidmd.errors import SceneError
-    from rigidmd.studies.accuracy import averages_report, report
-    from rigidmd.studies.accuracy.accuracy import measure_accuracy
+    from rigidmd.studies.accuracy import accuracy, averages_report
     from rigidmd.studies.accuracy.averages import SAMPLE_PS, measure_averages
 
     scene = read_scene(options)
@@ -53,10 +52,11 @@ def _accuracy(options: Options) -> int:
         return 0
     if options.sample_ps is not None:
         raise SceneError("--sample-ps", ["it needs --averages"])
+    settings = integrators, timesteps, options.span, options.repeats
     write_study(
-        folder, options.force, report.FILES, "compiling and running the reference",
-        lambda progress: measure_accuracy(scene, integrators, timesteps, options.span, options.repeats, progress),
-        lambda found: [*report.recommendations(found), "", report.table_text(found)],
-        report.write_accuracy,
+        folder, options.force, accuracy.FILES, "compiling and running the reference",
+        lambda progress: accuracy.measure_accuracy(scene, *settings, progress),
+        lambda found: [*accuracy.recommendations(found), "", accuracy.table_text(found)],
+        accuracy.write_accuracy,
     )  # fmt: skip
     return 0

@@ -127,7 +127,8 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96 / 1.12), aspect="equal", xlim=(-half, half), ylim=(-half, half))
     axes.set_axis_off()
     for i in np.flatnonzero(m.epsilon > 0).tolist():
-        colour, dashed = _colour(m, i) if m.elements[i] != "H" else OTHER, {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
+        colour = COLOURS.get(m.elements[i], OTHER) if m.elements[i] != "H" else OTHER
+        dashed = {"lw": 0.8, "ls": (0, (4, 3)), "zorder": 1}
         axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fc=colour, alpha=0.07, lw=0, zorder=1))
         axes.add_patch(Circle(seen[i, :2], m.sigma[i] / 2, fill=False, ec=colour, alpha=0.45, **dashed))
     bonded = _links(axes, m, seen, radius)
@@ -163,10 +164,6 @@ def _view(m: Molecule) -> np.ndarray:
     return forward @ about_up
 
 
-def _colour(m: Molecule, i: int) -> str:
-    return COLOURS.get(m.elements[i], OTHER)
-
-
 def _links(axes, m: Molecule, seen: np.ndarray, radius: np.ndarray) -> list[tuple]:
     """Draw bonds between the surfaces of spheres. Returns points that labels must not cover."""
     taken = []
@@ -194,7 +191,7 @@ def _sphere(axes, m: Molecule, i: int, seen: Any, radius: float) -> None:
     if m.masses[i] == 0:
         axes.add_patch(RegularPolygon(seen[:2], 4, radius=radius, fc="white", ec=COOL, lw=1.5, zorder=6.5))
         return
-    base, steps, order = np.array(to_rgb(_colour(m, i))), 24, _order(seen[2])
+    base, steps, order = np.array(to_rgb(COLOURS.get(m.elements[i], OTHER))), 24, _order(seen[2])
     for k in range(steps):
         fraction = k / (steps - 1)  # from the dark rim to the light spot
         colour = np.clip(base * (0.72 + 0.33 * fraction) + 0.55 * max(0.0, fraction - 0.45) ** 2, 0, 1)

@@ -208,16 +208,8 @@ def _files(record: Record) -> str:
         if path.name.startswith(".") or not path.is_file():
             continue
         text = "a figure" if path.suffix in (".png", ".svg") else about.get(path.name, "")
-        rows.append([path.name, _size(path.stat().st_size), text])
-    return table(["file", "size", ""], rows, words=True)
-
-
-def _size(size: float) -> str:
-    for unit in ("B", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} GB"
+        rows.append([path.name, f"{path.stat().st_size / 1000:,.1f}", text])
+    return table(["file", "size (kB)", ""], rows, words=True)
 
 
 def _repeat(record: Record) -> Iterator[str]:

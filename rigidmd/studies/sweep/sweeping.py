@@ -1,7 +1,9 @@
 """`rigidmd sweep`: its folder is opened, its points run here or by a script for Slurm, its results are written."""
 
 import contextlib
+import json
 import os
+import re
 import shlex
 import signal
 import time as clock
@@ -337,16 +339,5 @@ class Waiting:
 
 def code_kind(scene: Scene) -> str:
     """A text that is equal for scenes that compile the same code: keys and strings, without numbers and files."""
-
-    def bare(value: Any) -> Any:
-        match value:
-            case bool() | str() | None:
-                return value
-            case int() | float():
-                return 0
-            case dict():
-                return {key: bare(inner) for key, inner in sorted(value.items())}
-            case _:
-                return [bare(inner) for inner in value]
-
-    return repr(bare(keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))))
+    kept = keys_of(plain(scene), (*scene.inputs, *scene.embedded_files, *NOT_COMPARED))
+    return re.sub(r"-?\b\d[\d.e+-]*", "0", json.dumps(kept, sort_keys=True))
