@@ -4,7 +4,6 @@
 import csv
 import re
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -38,7 +37,7 @@ def write_results(
     frames_used : see `AnalysisOutput`; failed : analysis -> a sentence on why it has failed
     """
     known = read_table(folder)
-    owner = {name: analysis for analysis, entry in known.items() for name in entry["files"]}
+    owner = {name: analysis for analysis, entry in known.items() for name in entry.files}
     marked = written_by_runs(folder)
     new, files = {}, {}
     for result in results:
@@ -50,10 +49,12 @@ def write_results(
             if (folder / name).exists() and not is_ours:
                 raise OutputError(f"{folder / name} exists and is not of an analysis; rename {result.name}")
     add_to_folder(folder, [ANALYSIS, *new])
-    entries, curves = dict(known), [curve for result in results for curve in result.curves]
+    entries, curves = {}, [curve for result in results for curve in result.curves]
+    for name, entry in known.items():
+        entries[name] = entry.model_dump(by_alias=True) | {"values": [value._asdict() for value in entry.values]}
     for result in [*results, *(AnalysisResult(name, name, notes=[reason]) for name, reason in failed.items())]:
         entries[result.name] = {
-            "about": result.about, "values": [asdict(value) for value in result.values], "notes": result.notes,
+            "about": result.about, "values": [value._asdict() for value in result.values], "notes": result.notes,
             "curves": [{key: getattr(curve, key) for key in _Curve.model_fields} for curve in result.curves],
             "files": files.get(result.name, []), "stretch": frames_used,
         }  # fmt: skip
@@ -107,19 +108,19 @@ class _Analyses(BaseModel):
     analyses: dict[str, _Entry]
 
 
-def read_table(folder: Path) -> dict[str, Any]:
+def read_table(folder: Path) -> dict[str, _Entry]:
     """The entries of analysis.json by analysis, if there are any. Raises OutputError."""
     found = read_json(folder / ANALYSIS, _Analyses, "; remove it, and analyse again")
-    return {} if found is None else found.model_dump(by_alias=True)["analyses"]
+    return {} if found is None else found.analyses
 
 
 def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     """The results of analyses in the folder of a run, each with a phrase on the frames used. Raises OutputError."""
     found = []
     for name, entry in read_table(folder).items():
-        curves, used = [], entry["stretch"]
-        for described in entry["curves"]:
-            path = folder / f"{Path(described['file']).name}.csv"
+        curves, used = [], entry.frames_used
+        for described in entry.curves:
+            path = folder / f"{Path(described.file).name}.csv"
             read = read_columns(path)
             if read is None or not read.cells:
                 raise OutputError(f"{path} cannot be read: it has no curve; analyse again")
@@ -127,10 +128,10 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
             table = {title: read.numbers(title) for title in read.cells}
             columns = {t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}}
             errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
-            curves.append(Curve(**described | {"axis": (head, table[head]), "columns": columns, "errors": errors}))
-        values = [Value(**value) for value in entry["values"]]
-        phrase = f"{used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps"
-        found.append((AnalysisResult(name, entry["about"], values, curves, entry["notes"]), phrase))
+            axis = (head, table[head])
+            curves.append(Curve(**described.model_dump(), axis=axis, columns=columns, errors=errors))
+        phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
+        found.append((AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase))
     return found
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +21,7 @@ MIN_CORRELATION_TIMES = 20.0
 Measured = tuple[np.ndarray, np.ndarray]  # an array and its standard error
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """A value with its standard error, or a note on why there is none.
 
     correlation_ps : correlation time of the data

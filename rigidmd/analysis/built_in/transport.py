@@ -1,6 +1,5 @@
 """Correlation functions; mean squared displacement, diffusion and viscosity, each with its error."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -107,7 +106,7 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         try:
             eta = viscosity(frames).value()
         except OutputError as error:
-            eta = replace(eta, note=str(error))
+            eta = eta._replace(note=str(error))
     for kind in frames.moving:
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(frames, kind, slopes)).tolist()
@@ -133,7 +132,7 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         note = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {eta.value:.3g} mPa s, {source}"
         doubt = more * (eta.error or 0.0) / eta.value
         both = None if value.error is None else float(np.hypot(value.error, doubt))
-        found.values.append(replace(value, name=name, value=value.value + more, error=both, note=note))
+        found.values.append(value._replace(name=name, value=value.value + more, error=both, note=note))
     if edge is None and frames.has_box:
         found.notes.append("no correction for the size of the box: the one of Yeh and Hummer is for cubic boxes")
     return found

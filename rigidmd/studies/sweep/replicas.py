@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,7 +121,7 @@ def _mean_value(values: list[Value], runs: int) -> Value:
     there = [value.value for value in values if value.value is not None]
     if len(there) < 2:
         only = next((value for value in values if value.value is not None), values[0])
-        return replace(only, note=f"of one of {runs} runs") if there else only
+        return only._replace(note=f"of one of {runs} runs") if there else only
     note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
     mean, error = float(np.mean(there)), float(standard_error(there))
     return Value(values[0].name, values[0].unit, mean, error, None, note)
