@@ -1,4 +1,6 @@
-"""`rigidmd help`."""
+"""`rigidmd help` and `rigidmd schema`."""
+
+import json
 
 from rigidmd.commands.arguments import Options, argument, command
 
@@ -18,4 +20,12 @@ def _help(options: Options) -> int:
     print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
     for name, about in found.items():
         print(f"  {name:<{width}}  {about}")
+    return 0
+
+
+@command(180, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json")
+def _schema(options: Options) -> int:
+    from rigidmd.scene import schema
+
+    print(json.dumps(schema(), indent=2, allow_nan=False))
     return 0

@@ -31,12 +31,9 @@ PIECE = 1 << 24  # bytes that are unpacked at a time
 
 
 def read_atoms(
-    path: Path,
-    frame: int | None = None,
-    atom_types: dict[str, str] | None = None,
-    topology: Path | None = None,
+    path: Path, frame: int | None = None, atom_types: dict[str, str] | None = None, topology: Path | None = None,
     content: bytes | None = None,
-) -> Atoms:
+) -> Atoms:  # fmt: skip
     """The atoms of a file, or of one of several structures in it. Raises StructureError.
 
     frame: 1 for the first, -1 for the last; None for the only structure of a file, or the last of a trajectory.

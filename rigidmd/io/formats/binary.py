@@ -7,13 +7,14 @@ between all frames.
 import contextlib
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import Frame
-from rigidmd.io.formats.through_mdanalysis import FrameFiles, content_of, index_of, scratch_file
+from rigidmd.io.formats.through_mdanalysis import FrameFiles, index_of, scratch_file
 
 NM_PER_A, PER_NM, NM = 0.1, 1000.0, 10.0  # the last in Å
 
@@ -34,7 +35,7 @@ def xtc_encoder(system: System, interval: float, velocities: bool) -> Encode:
         with scratch_file() as path:
             with XTCFile(path, "w") as file:
                 file.write(positions, box.astype(np.float32), step_in_32_bits(frame.step), frame.time, PER_NM)
-            return content_of(path)
+            return Path(path).read_bytes()
 
     return encode
 

@@ -63,7 +63,7 @@ class FrameFiles:
             writer: Any = mda.Writer(path, n_atoms=self.sites, format=self._name, **self._options, **options)
             with writer:
                 writer.write(self._universe.atoms) if write is None else write(writer, self._universe.atoms)
-            return content_of(path)
+            return Path(path).read_bytes()
 
 
 @contextlib.contextmanager
@@ -78,11 +78,6 @@ def scratch_file() -> Iterator[str]:
     else:
         with tempfile.TemporaryDirectory() as folder:
             yield str(Path(folder) / "frame")
-
-
-def content_of(path: str) -> bytes:
-    with open(path, "rb", buffering=0) as file:
-        return file.readall()
 
 
 #: The arguments of Python that run `main`.

@@ -1,6 +1,7 @@
 """`rigidmd stability`: runs named cases, each compared with a known answer; stability.csv and a page."""
 
 import html
+import platform
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -88,7 +89,7 @@ def conclusions(results: list[CaseResult]) -> list[str]:
     return [*failures, *unexpected, total]
 
 
-def write_stability(folder: Path, results: list[CaseResult], command: str, machine: str) -> list[Path]:
+def write_stability(folder: Path, results: list[CaseResult], command: str) -> list[Path]:
     titles = ["case", "group", "kind", "setting", "integrator", "step", "step_unit", "error", "allowed",
               "conserved_error", "verdict", "expected", "beyond", "seconds", "message"]  # fmt: skip
     lines: list[list] = []
@@ -106,26 +107,20 @@ def write_stability(folder: Path, results: list[CaseResult], command: str, machi
         ]  # fmt: skip
     cells = [["" if isinstance(x, float) and isnan(x) else x for x in line] for line in lines]
     write_csv(folder / FILES[0], [titles, *cells])
-    write_text(folder / FILES[1], stability_page(results, command, machine))
+    write_text(folder / FILES[1], stability_page(results, command))
     return [folder / name for name in FILES]
 
 
-def stability_page(results: list[CaseResult], command: str, machine: str) -> str:
+def stability_page(results: list[CaseResult], command: str) -> str:
     links = {f.name: Raw(f'<a href="#case-{plain(f.name)}">{plain(f.name)}</a>') for f in results}
-    glance = []
-    for f in results:
-        counts = Counter(t.verdict for t in f.runs)
-        counts.update(limit.beyond for limit in f.limits if limit.beyond in (UNDETECTED, CRASH))
-        cells = [Raw(f'<span class="{KINDS[v]}">{counts[v]}</span>' if counts[v] else "") for v in VERDICTS]
-        glance.append([links[f.name], *cells, f.sentence])
     meanings = [[Raw(_badge(verdict)), meaning] for verdict, meaning in VERDICTS.items()]
     bound = f"The longest step is that at which conserved quantities stay within {BOUND:g} of the kinetic energy."
     parts = [
         items(conclusions(results)),
-        section("At a glance", table(["case", *VERDICTS, ""], glance), table([], meanings, words=True)),
-        section("All integrators", table(HEADERS, rows_of(results), marked=links), f"<p>{html.escape(bound)}</p>"),
+        table([], meanings, words=True),
+        section("All cases", table(HEADERS, rows_of(results), marked=links), f"<p>{html.escape(bound)}</p>"),
         *map(_case, results),
-        section("How to repeat it", code(f"{command}    # on {machine}")),
+        section("How to repeat it", code(f"{command}    # on {platform.processor() or platform.machine()}")),
     ]
     return page("Stability", parts)
 
