@@ -2,11 +2,14 @@
 
 import csv
 import json
+import subprocess
+import sys
 
 import MDAnalysis as mda
 import numpy as np
 import pytest
-from support import BODIES, ROOT, CheckpointSchedule, build_body, write_scene
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from support import BODIES, ROOT, CheckpointSchedule, Picture, build_body, write_scene
 
 import rigidmd
 from rigidmd.commands.cli import main
@@ -307,3 +310,34 @@ def test_a_motion_that_is_not_stiff_gets_no_such_advice():
     assert run.engine.chosen_steps[0] > 50
     assert not run.engine.is_stiff
     assert run.engine._stiff_steps == 0
+
+
+def test_a_run_of_a_body_imports_nothing_that_it_does_not_use(tmp_path):
+    script = """
+import gc, linecache, sys
+from rigidmd.commands.cli import main
+from rigidmd.scene import Scene
+assert not linecache.cache  # pydantic reads sources at the import of a scene if it is to find docstrings
+assert main(["run", sys.argv[1], "--set", "run.duration_s=0.01", "--output", sys.argv[2]]) == 0
+assert gc.get_threshold()[0] >= 10_000
+print(*sys.modules)
+"""
+    scene, folder = ROOT / "systems" / "heavy_top_3.toml", tmp_path / "run"
+    done = subprocess.run([sys.executable, "-c", script, scene, folder], capture_output=True, text=True, check=True)
+    unused = {"ase", "rigidmd.engines.ode.engine", "rigidmd.forces.ewald.pme", "rigidmd.run.molecular", "rigidmd.view",
+              "matplotlib.pyplot", "scipy.integrate", "scipy.interpolate"}  # fmt: skip
+    assert unused & set(done.stdout.splitlines()[-1].split()) == set()
+    assert (folder / "axis.png").is_file()
+
+
+def test_a_figure_is_laid_out_once_and_drawn_once_for_each_file(tmp_path, monkeypatch):
+    drawn, laid_out = [], []
+    draw, lay_out = Picture.draw, ConstrainedLayoutEngine.execute
+    monkeypatch.setattr(Picture, "draw", lambda figure, renderer: (drawn.append(figure), draw(figure, renderer)))
+    monkeypatch.setattr(
+        ConstrainedLayoutEngine, "execute", lambda engine, figure: (laid_out.append(figure), lay_out(engine, figure))
+    )
+    scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.01})
+    files = Simulation(scene, tmp_path / "run").run().files
+    assert len(drawn) == len([path for path in files if path.suffix in (".png", ".svg")]) == 8
+    assert len(laid_out) == 4

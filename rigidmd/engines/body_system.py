@@ -10,7 +10,6 @@ from rigidmd.core.integrators import RK4, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.engines.cpu.engine import CpuEngine
-from rigidmd.engines.ode.engine import OdeEngine
 from rigidmd.engines.system import Sites
 from rigidmd.errors import SimulationError
 from rigidmd.forces.body.resistance import NoResistance
@@ -120,7 +119,9 @@ class BodySystem:
 
     def engine(self) -> CpuEngine:
         """A new engine for this body at time 0, which calls the functions in `applied`."""
-        kind = OdeEngine if self.scene.run.integrator in SOLVERS else CpuEngine
+        kind = CpuEngine
+        if self.scene.run.integrator in SOLVERS:
+            from rigidmd.engines.ode.engine import OdeEngine as kind  # SciPy is slow to import
         python_forces = {name: self._load_function(function) for name, function in self.applied.items()}
         return kind(*self.terms_at(0.0), python_forces=python_forces)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
-LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "$L_z$", "L_3": "$L_3$"}
+LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "L_z", "L_3": "L_3"}
 OMEGA = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 #: Lines with more points are rasterised in the SVG; level at which an error of exactly 0 is drawn.
@@ -33,6 +33,7 @@ def write_motion_figures(folder: Path, figures: dict[str, "Picture"]) -> list[Pa
     """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
     written = []
     for stem, figure in figures.items():
+        figure.lay_out(150)
         with settings({"svg.hashsalt": stem}):
             for suffix, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
                 written.append(folder / f"{stem}.{suffix}")
@@ -92,7 +93,7 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
         draw_front_and_back(sphere, ring, view, ring @ eye, (0.6, 0.2), color=INK, lw=0.7, ls=DASHED)
     _draw_path(sphere, path, view, path @ eye, half, np.zeros(2), COOL)
     _triad(sphere, view, "xyz", down)
-    sphere.set_title(f"from 25° {word} the horizon", **NOTE)
+    sphere.set_title(f"from 25° {word} the horizon", y=1.0, **NOTE)
     view = camera(side * UP, np.eye(3)[1])
     flat = path @ view[:2].T
     centre, near = (flat.max(0) + flat.min(0)) / 2, 0.625 * np.ptp(flat, axis=0).max()
@@ -104,7 +105,7 @@ def _axis_figure(columns: dict[str, np.ndarray], axis_body: np.ndarray, down: np
     _draw_path(disc, path, view, path @ view[2], half, centre, COOL)
     _triad(disc, view, "xy")
     zoom = f", enlarged {_enlargement(1.12 / near)}" if enlarged else ""
-    disc.set_title(f"from {word}{zoom}; dashed: its θ {_range(polar)}", **NOTE)
+    disc.set_title(f"from {word}{zoom}; dashed: its θ {_range(polar)}", y=1.0, **NOTE)
     _label_start(figure)
     return figure
 
@@ -249,9 +250,10 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
         axis.plot(columns["time"][::size], np.maximum(largest, FLOOR), color=color, lw=1.0, label=f"{label}: {most}")
     axis.axhline(np.finfo(float).eps, color=FAINT, lw=0.8, ls=":")
     axis.set_yscale("log")
+    axis.yaxis.set_major_formatter("{x:.0e}")  # as in the legend; powers of ten as formulas are slow to draw
     axis.set_ylim(FLOOR / 2, max(1e-13, 5 * max(np.nanmax(error) for error in errors.values())))
     note = f"largest of each {size} samples; " if size > 1 else ""
-    axis.set_title(f"{note}dotted: rounding, 2.2e-16; an error of exactly 0 is drawn at {FLOOR:.0e}", **NOTE)
+    axis.set_title(f"{note}dotted: rounding, 2.2e-16; an error of exactly 0 is drawn at {FLOOR:.0e}", y=1.0, **NOTE)
     axis.set(xlabel="time (s)", ylabel="relative error", xmargin=0)
     axis.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axis.spines[["top", "right"]].set_visible(False)

@@ -8,7 +8,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from rigidmd.figures.style import save_figure
+from rigidmd.figures.style import save_figure, settings
 
 #: Dots per inch of a figure in a notebook, drawn twice as fine for sharp screens.
 DPI = 80
@@ -21,9 +21,21 @@ class Picture(Figure):
     """
 
     def draw(self, renderer) -> None:
+        self._take_texts_as_written()
+        super().draw(renderer)
+
+    def lay_out(self, dpi: float) -> None:
+        """Arrange the axes once, for files of this resolution: a layout engine lets `savefig` draw everything twice."""
+        self._take_texts_as_written()
+        self.dpi = dpi
+        if engine := self.get_layout_engine():
+            engine.execute(self)
+        with settings({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+            self.set_layout_engine(None)
+
+    def _take_texts_as_written(self) -> None:
         for text in _texts(self):
             text.set_parse_math(False)
-        super().draw(renderer)
 
     def png(self) -> tuple[bytes, dict[str, float]]:
         """The figure as PNG, and the width and height at which it is shown."""

@@ -90,6 +90,7 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
         figure = draw()
         if title:
             figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
+        figure.lay_out(150)
         save_figure(figure, temporary, dpi=150)
 
 

@@ -188,6 +188,7 @@ class EnergyFigure(Observer):
 
     def end(self, run: "Simulation", results: "Results") -> None:
         for figure in run_figures(run.system, results.samples, results.summary).values():
+            figure.lay_out(150)
             with atomic_file(run.path(ENERGY)) as temporary:
                 save_figure(figure, temporary, dpi=150)
             results.files.append(run.path(ENERGY))

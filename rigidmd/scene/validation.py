@@ -1,8 +1,11 @@
 """Validation of input tables: strict value types for pydantic, and its errors as messages with key and line."""
 
+import ast
 import difflib
+import inspect
 import re
 from collections.abc import Collection, Iterable
+from itertools import pairwise
 from math import isfinite
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -38,10 +41,22 @@ MOST_SUGGESTIONS = 8
 LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
+def _add_docstrings(schema: dict[str, Any], kind: type[BaseModel]) -> None:
+    """Describe keys in a JSON schema by their docstrings. The option `use_attribute_docstrings` of pydantic parses all
+    sources at each import instead, which took a quarter of the time to read a scene."""
+    for owner in kind.__mro__[:-2]:
+        classes = ast.parse(inspect.getsource(not_none(inspect.getmodule(owner)))).body
+        bodies = [node.body for node in classes if isinstance(node, ast.ClassDef) and node.name == owner.__name__]
+        for key, text in pairwise(bodies[0] if bodies else []):
+            if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
+                described = schema["properties"].get(ast.unparse(key.target), {})
+                described.setdefault("description", inspect.cleandoc(ast.literal_eval(text.value)))
+
+
 class Section(BaseModel):
     """A frozen table of a TOML file; unknown keys are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, json_schema_extra=_add_docstrings)
 
     @model_validator(mode="after")
     def _is_sound(self):
