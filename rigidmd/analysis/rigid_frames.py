@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from rigidmd.core.state import NO_CELL
-from rigidmd.engines.samples import moving
+from rigidmd.engines.samples import equilibrated_from, moving
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.run_files import TENSOR_FILE, read_tensor
@@ -188,7 +188,6 @@ def fit_frames(
 
 #: Most numbers of 8 bytes of frames in memory; a longer trajectory is thinned out.
 MOST_NUMBERS = 150_000_000
-MIN_SAMPLES = 40  # least samples of a stage for the detection of its equilibration
 
 
 def frames_of_folder(
@@ -296,26 +295,7 @@ def _last_stage(system: System, columns: dict[str, np.ndarray]):
     for k in reversed(range(len(stages))):
         of_stage = np.flatnonzero(shown & (columns["stage"] == k))
         if len(of_stage) and time[of_stage[-1]] > (first := time[max(0, of_stage[0] - 1)]):
-            last = time[of_stage[-1]]
-            begin = production_start(columns, shown & (time >= first) & (time <= last), stages[k].changes_box)
-            return stages[k], float(first), float(last), begin, shown
+            start = equilibrated_from({name: values[of_stage] for name, values in columns.items()}, stages[k])
+            begin = time[of_stage[start]] if start or stages[k].volume else first
+            return stages[k], float(first), float(time[of_stage[-1]]), float(begin), shown
     raise OutputError("the run has not reached a stage in which time passes")
-
-
-def production_start(columns: dict[str, np.ndarray], of_stage: np.ndarray, box_moves: bool) -> float:
-    """Time (ps) at which a stage, the samples `of_stage`, is equilibrated: the later one of the times for the potential
-    energy and, if the box moves, the density. See `steady_from`."""
-    time = columns["time"][of_stage]
-    if len(time) < MIN_SAMPLES:
-        return float(time[0])
-    names = ("potential", "density") if box_moves else ("potential",)
-    return float(time[max(steady_from(columns[name][of_stage]) for name in names)])
-
-
-def steady_from(values: np.ndarray) -> int:
-    """Index in the first half of a series (n,) from which on its mean has the smallest standard error of independent
-    values: the marginal standard error rule (White 1997, Simulation 69, 323)."""
-    left = np.arange(len(values), 0, -1)
-    sums, squares = (np.cumsum(x[::-1])[::-1] for x in (values - values.mean(), (values - values.mean()) ** 2))
-    error = (squares - sums**2 / left) / left.astype(float) ** 2
-    return int(np.argmin(error[: len(values) // 2 + 1]))

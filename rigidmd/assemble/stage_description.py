@@ -43,6 +43,8 @@ def describe_stage(stage: Stage) -> list[str]:
         text += f", {_ramp(stage.temperatures)} K by {kind.replace('_', ' ')}, {described}"
     if stage.has_barostat:
         text += f", {_barostat(stage)}"
+    if stage.volume:
+        text += ", in the mean box of the stage before"
     sampled, conserved = DISTRIBUTIONS[stage.ensemble]  # up to the error of the step
     if stage.ensemble == "npt" and stage.pressure_coupling != "isotropic":
         sampled += ", with the invariant measure of the shape"

@@ -6,12 +6,13 @@ One table serves files, displays and documentation. For molecules it is the reco
 from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
+from rigidmd.core.statistics import steady_from
 from rigidmd.scene.stage import Stage
 
 
@@ -213,3 +214,32 @@ _VALUES = attrgetter(*NUMBERS)
 def moving(stages: Sequence[Stage], of: np.ndarray) -> np.ndarray:
     """Whether each sample (n,) is of motion and not of a minimisation; `of` has the index of its stage."""
     return ~np.isin(of, [k for k, stage in enumerate(stages) if stage.is_minimisation])
+
+
+#: Least samples of a stage for the detection of its equilibration.
+LEAST_SAMPLES = 40
+
+
+def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> int:
+    """Index from which on the samples of a stage are of its equilibrium: where the potential energy and, if the box
+    moves, the density are steady (`steady_from`). 0 with few samples, and if the temperature or pressure changes."""
+    if len(of_stage["time"]) < LEAST_SAMPLES or stage.ramps:
+        return 0
+    return max(steady_from(of_stage[name]) for name in ("potential", *(["density"] if stage.changes_box else [])))
+
+
+def equilibrated(of_stage: Samples, stage: Stage) -> Samples:
+    """The samples of the equilibrated part of a stage."""
+    return Samples(of_stage.stages, of_stage.user_terms, of_stage.table()[equilibrated_from(of_stage, stage) :])
+
+
+def describe_equilibrated(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage, begin: float) -> str:
+    """The equilibrated part of a stage that began at a time (ps), such as "the last 14.2 of 20 ps"."""
+    time, start = of_stage["time"], equilibrated_from(of_stage, stage)
+    whole = f"all {time[-1] - begin:.4g} ps"
+    if stage.ramps:
+        return f"{whole}, in which the set point changes"
+    if len(time) < LEAST_SAMPLES:
+        return f"{whole}, too short to detect equilibration"
+    part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps" if start else whole
+    return f"{part}, not yet steady" if start == len(time) // 2 else part

@@ -45,6 +45,7 @@ class StageSummary(BaseModel):
     drift_error_kJ_mol_ns_per_molecule: Bounded | None = None
     drift_kT_ns_per_degree_of_freedom: Bounded | None = None
     drift_error_kT_ns_per_degree_of_freedom: Bounded | None = None
+    drift_verdict: str | None = None
     energy_rms_kJ_mol_per_molecule: Bounded | None = None
     ns_per_day: Bounded | None = None
 

@@ -28,6 +28,7 @@ from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import check_forces, coulomb_errors
+from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
@@ -235,6 +236,7 @@ class MolecularRun(RunPart):
         record.moves[record.position.segment] = self.engine.moves or (0, 0)
         record.position.segment = k
         was_auto, moves = self.scene.stages[k].is_auto, not self.scene.stages[k].is_minimisation
+        scale_to_mean_box(self.system, self.state, self.samples(), k)
         if was_auto:
             self._choose(k)
         if moves:

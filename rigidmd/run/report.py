@@ -1,8 +1,8 @@
 """The summary of a run as text."""
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 
-from rigidmd.core.statistics import NO_ERROR, format_signed
+from rigidmd.core.statistics import NO_ERROR, format_signed, format_with_error
 
 POSITIONS = {
     "unwrapped": "molecules follow continuous paths",
@@ -105,14 +105,27 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     if stage["minimum"]:
         return _minimum_rows(stage, stage["minimum"])
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
+    rows.append(("means", f"over {stage['means_over']}"))
+    if stage.get("volume_nm3") is not None:
+        mean = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"])
+        rows.append(("volume", f"{mean} nm³, the mean of the stage before, at whose end it was "
+                               f"{stage['volume_before_nm3']:.4g} nm³"))  # fmt: skip
     if stage["temperature_K"] is not None:
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
-        rows.append(("temperature", f"{value} ({_temperatures(stage, 'K')})"))
-        if parts := _temperatures(stage, "unbiased_K"):
+        rows.append(("temperature", _with_set_point(value, stage["set_temperature_K"], "K")))
+        rows.append(("", _temperatures(stage, "")))
+        if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} without the error of the time step"))
-    rows.append(("potential", f"{stage['potential_kJ_mol_per_molecule']:.3f} kJ/mol per molecule"))
+        if (scatter := stage["temperature_scatter_K"]) is not None:
+            off, before = stage["temperature_K"] - stage["temperature_before_K"], stage["temperature_before_K"]
+            moment = "this stage keeps the energy of one moment; such temperatures scatter by"
+            more = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
+            rows.append(("", f"{off:+.2g} K from {before:g} K: {moment} {scatter:.2g} K{more}"))
+    error = stage["potential_error_kJ_mol_per_molecule"]
+    rows.append(("potential", _with_error(stage["potential_kJ_mol_per_molecule"], error, 3, "kJ/mol per molecule")))
     if stage["pressure_bar"] is not None:
-        rows.append(("pressure", _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")))
+        value = _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")
+        rows.append(("pressure", _with_set_point(value, stage["set_pressure_bar"], "bar")))
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
         edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
@@ -123,23 +136,38 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     if stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"
         value, error = stage["drift_kJ_mol_ns_per_molecule"], stage["drift_error_kJ_mol_ns_per_molecule"]
-        rows.append(("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what})"))
+        verdict = f": {stage['drift_verdict']}" if stage["drift_verdict"] else ""
+        rows.append(("drift", f"{format_signed(value, error)} kJ/mol/ns per molecule ({what}){verdict}"))
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
-        if stage["drift_over_kinetic_std"] is not None:
-            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy in total"
-            rows.append(("", deviations))
+        if stage["drift_over_kinetic_std"] is not None and stage["drift_kT_per_degree_of_freedom"] is not None:
+            total = f"{stage['drift_kT_per_degree_of_freedom']:+.2g} kT per degree of freedom, "
+            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy"
+            rows.append(("", f"in total {total}{deviations}"))
         noise = stage["energy_rms_kJ_mol_per_molecule"]
         rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms about the line"))
     return rows
 
 
 def _with_error(value: float, error: float | None, places: int, unit: str = "") -> str:
-    text = f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+    text = format_with_error(value, error) if error else f"{value:.{places}f}"
     return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
-def _temperatures(stage: dict, suffix: str) -> str:
-    motions = (("T_trans", f"temperature_translation_{suffix}"), ("T_rot", f"temperature_rotation_{suffix}"))
-    return ", ".join(f"{name} {stage[key]:.2f}" for name, key in motions if stage[key] is not None)
+def set_point(value: float | Sequence[float] | None, unit: str) -> str:
+    """The set point of a thermostat or barostat; two values change over the stage. Empty without one."""
+    values = list(value) if isinstance(value, Sequence) else [] if value is None else [value]
+    return f"{(' to ' if len(values) == 2 else ', ').join(f'{each:g}' for each in values)} {unit}" if values else ""
+
+
+def _with_set_point(value: str, given: float | Sequence[float] | None, unit: str) -> str:
+    return value if given is None else f"{value}, set point {set_point(given, unit)}"
+
+
+def _temperatures(stage: dict, kind: str) -> str:
+    found = []
+    for name, motion in (("T_trans", "translation"), ("T_rot", "rotation")):
+        if (value := stage[f"temperature_{motion}{kind}_K"]) is not None:
+            found.append(f"{name} {_with_error(value, stage[f'temperature_{motion}{kind}_error_K'], 2)}")
+    return f"{', '.join(found)} K" if found else ""

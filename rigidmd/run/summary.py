@@ -10,7 +10,7 @@ from rigidmd.core.state import REMOVED, State
 from rigidmd.core.statistics import ENERGY_ERROR, format_with_error, mean_and_error, slope
 from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
-from rigidmd.engines.samples import Sample, Samples
+from rigidmd.engines.samples import LEAST_SAMPLES, Sample, Samples, describe_equilibrated, equilibrated
 from rigidmd.engines.system import System
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
@@ -22,12 +22,19 @@ if TYPE_CHECKING:
 MOTION_KEYS = (
     "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "temperature_K", "temperature_error_K",
     "temperature_translation_K", "temperature_rotation_K", "temperature_translation_unbiased_K",
-    "temperature_rotation_unbiased_K", "pressure_error_bar", "drift_kJ_mol_ns_per_molecule",
+    "temperature_rotation_unbiased_K", "temperature_translation_error_K", "temperature_rotation_error_K",
+    "temperature_translation_unbiased_error_K", "temperature_rotation_unbiased_error_K", "temperature_before_K",
+    "temperature_scatter_K", "means_over", "equilibrated_from_ps", "set_temperature_K", "set_pressure_bar",
+    "potential_error_kJ_mol_per_molecule", "pressure_error_bar", "drift_verdict", "drift_kJ_mol_ns_per_molecule",
     "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
-    "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
+    "drift_error_kT_ns_per_degree_of_freedom", "drift_kT_per_degree_of_freedom", "drift_over_kinetic_std",
+    "energy_rms_kJ_mol_per_molecule",
 )  # fmt: skip
 #: The second half of a stage has notes if it has enough samples, on effects larger than some standard errors.
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
+#: A drift is significant from this number of standard errors on: in random walks of the energy these are up to 1.5
+#: times too small (`slope`).
+SIGNIFICANT = 3.0
 #: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
 #: Error of the temperature by the step, and difference of T_trans and T_rot, as fractions.
@@ -158,8 +165,7 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
     found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
-    limit = max(DRIFT_LIMIT / 1000, DRIFT_SUM_LIMIT / (time[-1] - time[0])) * thermal  # kJ/mol/ps
-    if thermal > 0 and abs(line.value) > limit + STANDARD_ERRORS * line.error:
+    if thermal > 0 and abs(line.value) > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error:
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
         smooth = "" if system.scene.forces.truncation == "smooth_switch" else " or truncation = 'smooth_switch'"
         hides = "; the thermostat hides this and leaves temperatures wrong" if stage.has_thermostat else ""
@@ -198,36 +204,79 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     return found
 
 
+def _drift_limit(time: float) -> float:
+    """The largest small drift in a time (ps), kT/ps per degree of freedom."""
+    return max(DRIFT_LIMIT / 1000, DRIFT_SUM_LIMIT / time)
+
+
+def _drift_verdict(drift: float, error: float, limit: float) -> str | None:
+    """Whether a drift is significant, against its standard error and the largest small drift; None without an error."""
+    if not error > 0:
+        return None
+    count = abs(drift) / error
+    if count < SIGNIFICANT:
+        return f"not significant, {count:.1f} standard errors"
+    return f"significant, {count:.1f} standard errors, {'but small' if abs(drift) <= limit else 'and large'}"
+
+
 def _stage(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
-    """Values of one stage. Its drift is counted from the last sample before it."""
+    """Values of one stage: means over its equilibrated part, and its drift since the last sample before it."""
     of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
     first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
+    steady = equilibrated(of_stage, stage)
     n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
     line = slope(np.append(first.time, time), np.append(0.0, drift)) if len(before) else slope(time, drift)
     motions = [f"temperature_{motion}{kind}" for kind in ("", "_unbiased") for motion in MOTIONS]
-    means = {name: mean_and_error(of_stage[name]) for name in ("temperature", *motions, "pressure_bar")}
-    temperature, pressure = means["temperature"], means["pressure_bar"]
+    means = {name: mean_and_error(steady[name]) for name in ("temperature", *motions, "pressure_bar")}
+    temperature, pressure, error = means["temperature"], means["pressure_bar"], mean_and_error(steady["potential"])[1]
     spread, duration = float(of_stage["kinetic"].std()), steps * stage.timestep_fs * FEMTOSECOND
     thermal = BOLTZMANN / KJ_PER_MOL * (temperature[0] or 0.0) * system.freedom_in(k).total
     per_kt = [_finite_or_none(rate * 1000 / thermal) if thermal > 0 else None for rate in line[:2]]
-    return {
+    values = {
         "name": stage.label, "ensemble": stage.ensemble, "integrator": stage.integrator,
         "timestep_fs": stage.timestep_fs, "steps": steps, "duration_ps": duration, "computing_s": computing,
         "steps_per_s": speed, "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
+        "means_over": describe_equilibrated(of_stage, stage, first.time),
+        "equilibrated_from_ps": float(steady["time"][0]) if len(time) >= LEAST_SAMPLES else None,
+        "set_temperature_K": stage.temperature_K, "set_pressure_bar": stage.pressure_bar,
         "temperature_K": temperature[0], "temperature_error_K": temperature[1],
         **{f"{name}_K": means[name][0] for name in motions},
-        "potential_kJ_mol_per_molecule": float(np.mean(of_stage["potential"])) / n,
+        **{f"{name}_error_K": means[name][1] for name in motions},
+        "temperature_before_K": None, "temperature_scatter_K": None,
+        "potential_kJ_mol_per_molecule": float(steady["potential"].mean()) / n,
+        "potential_error_kJ_mol_per_molecule": None if error is None else error / n,
         "pressure_bar": pressure[0], "pressure_error_bar": pressure[1],
-        **(_box_means(of_stage) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
+        **(_box_means(steady) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
+        "drift_verdict": _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal) if duration else None,
         "drift_kJ_mol_ns_per_molecule": _finite_or_none(line.value * 1000 / n),
         "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
         "drift_kT_ns_per_degree_of_freedom": per_kt[0], "drift_error_kT_ns_per_degree_of_freedom": per_kt[1],
+        "drift_kT_per_degree_of_freedom": None if per_kt[0] is None else per_kt[0] * duration / 1000,
         "drift_over_kinetic_std": _finite_or_none(line.value * duration / spread) if spread else None,
         "energy_rms_kJ_mol_per_molecule": _finite_or_none(line.rms / n), "minimum": None,
     }  # fmt: skip
+    earlier = system.scene.stages[k - 1] if k else stage
+    if stage.ensemble == "nve" and earlier.has_thermostat and len(steady) >= MIN_SAMPLES:
+        values["temperature_before_K"] = earlier.temperatures[1]
+        values["temperature_scatter_K"] = _temperature_scatter(steady["temperature"], system.freedom_in(k).total)
+    if stage.volume:
+        volume = equilibrated(before, earlier)["volume"]
+        values["volume_nm3"], values["volume_error_nm3"] = mean_and_error(volume)
+        values["volume_before_nm3"] = first.volume
+    return values
+
+
+def _temperature_scatter(temperature: np.ndarray, freedom: int) -> float | None:
+    """Standard deviation (K) of the mean temperatures of nve stages that start from states of a canonical ensemble.
+
+    It is T sqrt(k/C_v). Without the heat capacity: the variance of the temperature of canonical states, 2 T²/f, is the
+    mean of its variances at their energies plus the variance of its means at them. None if sampling hides it.
+    """
+    square = 2 * temperature.mean() ** 2 / freedom - temperature.var() if freedom else 0.0
+    return sqrt(square) if square > 0 else None
 
 
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:

@@ -27,6 +27,7 @@ USED = {
     "timestep_fs": MOVING,
     "integrator": MOVING,
     "rotor": MOVING,
+    "volume": {"nve", "nvt"},
     "temperature_K": {"nvt", "npt"},
     "thermostat": {"nvt", "npt"},
     "pressure_bar": {"npt", "nph", "minimise"},
@@ -68,6 +69,9 @@ class Timing(Section):
     """Time step"""
     temperature_K: Positive | tuple[Positive, Positive] | None = None
     """Temperature of the thermostat; two for a linear change over the stage, [300, 240]"""
+    volume: Literal["mean"] | None = None
+    """With nve and nvt, mean: the box is scaled at the start to the mean, over its equilibrated part, of the npt or nph
+    stage just before. Default: the box as it is at the end of that stage"""
 
 
 class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):

@@ -18,12 +18,14 @@ from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
+from rigidmd.engines.samples import describe_equilibrated, equilibrated_from
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
+from rigidmd.run.report import set_point
 from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation
@@ -97,18 +99,22 @@ def _means(record: Record) -> str:
     for k in np.unique(seen["stage"][record.moving]):
         of_stage = np.flatnonzero(seen["stage"] == k)
         time = seen["time"][of_stage]
-        begin = seen["time"][of_stage[0] - 1] if of_stage[0] else time[0]
-        cells = [seen["stage_name"][of_stage[0]], f"{time[-1] - begin:g}", len(of_stage)]
+        begin = float(seen["time"][max(0, of_stage[0] - 1)])
+        values, stage = {name: column[of_stage] for name, column in seen.items()}, record.molecules.scene.stages[k]
+        start, given = equilibrated_from(values, stage), [(stage.temperature_K, "K"), (stage.pressure_bar, "bar")]
+        set_points = "; ".join(filter(None, (set_point(value, unit) for value, unit in given)))
+        cells = [stage.label, describe_equilibrated(values, stage, begin), len(time) - start, set_points]
         for column, _, per_molecule in shown:
-            values = seen[column][of_stage] / (n if per_molecule else 1)
+            values = seen[column][of_stage[start:]] / (n if per_molecule else 1)
             if np.ptp(values) <= 1e-9 * np.abs(values).max():
                 cells.append(f"{values[0]:.6g}")
                 continue
             value, error = mean_and_error(values)
             cells.append("" if value is None else format_with_error(value, error))
         rows.append(cells)
-    text = "Means over a whole stage ± one standard error, from log.csv, without minimisations; few rows have no error."
-    return f'{table(["stage", "ps", "samples", *(title for _, title, _ in shown)], rows)}<p class="faint">{text}</p>'
+    text = "Means ± one standard error over the equilibrated part of a stage, from log.csv; few samples have no error."
+    titles = ["stage", "means over", "samples", "set point", *(title for _, title, _ in shown)]
+    return f'{table(titles, rows)}<p class="faint">{text}</p>'
 
 
 def _drifts(record: Record) -> str:
@@ -120,10 +126,12 @@ def _drifts(record: Record) -> str:
             error = value.replace("drift_", "drift_error_")
             known = stage.get(value) is not None and stage.get(error) is not None
             cells.append(format_signed(stage[value], stage[error]) if known else "")
+        cells.append(stage.get("drift_verdict") or "")
         cells += [_number(stage.get("energy_rms_kJ_mol_per_molecule")), _number(stage.get("ns_per_day"))]
         rows.append(cells)
     titles = ["stage", "integrator", "step (fs)", "drift (kJ/mol/ns per molecule)",
-              "drift (kT/ns per degree of freedom)", "energy noise (kJ/mol per molecule)", "ns/day"]  # fmt: skip
+              "drift (kT/ns per degree of freedom)", "verdict",
+              "energy noise (kJ/mol per molecule)", "ns/day"]  # fmt: skip
     return table(titles, rows)
 
 

@@ -7,7 +7,7 @@ integrator, so one weighted fit has the same a for all integrators and thermosta
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from math import floor, inf, log10, nan, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -15,8 +15,10 @@ from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.model import remove_momentum
+from rigidmd.engines.samples import Samples
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
+from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
@@ -278,10 +280,13 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
     """A simulation of a scene, and the state in which its last stage begins. Earlier stages run without files."""
     simulation = Simulation(scene)
     if len(scene.stages) > 1:
-        quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": 1e9})
+        interval = scene.output.log_interval_ps if scene.stages[-1].volume else 1e9
+        quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
         resolved = simulation.scene
         earlier = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
-        return simulation, earlier.run().state
+        results = earlier.run()
+        scale_to_mean_box(simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1)
+        return simulation, results.state
     simulation.start()
     return simulation, simulation.state
 
