@@ -360,7 +360,7 @@ def test_the_command_writes_a_table_a_figure_and_a_page(tmp_path, capsys):
 ])  # fmt: skip
 def test_arguments_are_refused_before_anything_is_compiled_or_run(arguments, error, capsys, tmp_path):
     water = ["accuracy", str(ROOT / "systems" / "water.toml"), "-o", str(tmp_path / "p")]
-    thermal = ["--set", "stages.1.ensemble=nvt", "--set", "stages.1.temperature_K=298.15"]
+    thermal = ["--set", "stages.production.ensemble=nvt", "--set", "stages.production.temperature_K=298.15"]
     assert main([*water, *thermal, *arguments]) == 2
     said = capsys.readouterr()
     assert error in said.err
@@ -670,7 +670,7 @@ def test_orders_cost_and_temperatures_of_512_waters():
     """Slopes over a decade, the best scheme at 1e-5 kJ/mol, and both temperatures at 2 and 4 fs."""
     changes = {
         "molecules.0.count": 512, "forces.truncation": "smooth_switch", "forces.switch_start_A": 5.0,
-        "stages.0.duration_ps": 10.0,
+        "stages.equilibration.duration_ps": 10.0,
     }  # fmt: skip
     scene = Scene.read(ROOT / "systems" / "water.toml", changes)
     found = measure_accuracy(scene, ["velocity_verlet", "two_stage", "chin_4a", "srkn_4", "srkn_6"], repeats=1)

@@ -34,7 +34,7 @@ from rigidmd.units import DEBYE
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
 from peer_engines import gro, top
 
-SHORT = {"stages.0.duration_ps": 0.02, "stages.1.duration_ps": 0.2, "output.trajectory_interval_ps": 0.004,
+SHORT = {"stages.minimisation": None, "stages.equilibration.duration_ps": 0.02, "stages.production.duration_ps": 0.2, "output.trajectory_interval_ps": 0.004,
          "output.trajectory": "trajectory.trr", "output.log_interval_ps": 0.004, "output.figures": False,
          "output.pressure_tensor_interval_ps": 0.004}  # fmt: skip
 GROMACS = shutil.which("gmx")
@@ -560,7 +560,11 @@ def test_a_pressure_tensor_needs_a_box():
 def text_run(tmp_path_factory):
     """A run whose frames are text."""
     folder = tmp_path_factory.mktemp("runs") / "text"
-    more = {"output.trajectory": "t.xyz", "stages.1.duration_ps": 0.04, "output.pressure_tensor_interval_ps": False}
+    more = {
+        "output.trajectory": "t.xyz",
+        "stages.production.duration_ps": 0.04,
+        "output.pressure_tensor_interval_ps": False,
+    }
     Simulation(Scene.read(ROOT / "systems" / "water.toml", SHORT | more), folder).run()
     return folder
 

@@ -231,8 +231,8 @@ def test_check_says_that_it_is_open(capsys):
     assert main(["check", str(TOP), "--set", "run.integrator=auto", "--set", "run.energy_error=1e-6"]) == 0
     assert "are chosen before the run" in capsys.readouterr().out
     water = str(ROOT / "systems" / "water.toml")
-    more = ["--set", "stages.1.integrator=auto", "--set", "stages.1.energy_error_kT=1e-4"]
-    assert main(["check", water, *more, "--set", "stages.1.timestep_fs=2.0"]) == 0
+    more = ["--set", "stages.production.integrator=auto", "--set", "stages.production.energy_error_kT=1e-4"]
+    assert main(["check", water, *more, "--set", "stages.production.timestep_fs=2.0"]) == 0
     assert "integrator and step chosen at its start for an error of 0.0001 kT" in capsys.readouterr().out
 
 
@@ -277,7 +277,7 @@ def test_a_large_bias_is_no_reason_for_an_unstable_step():
 
 def test_check_says_which_bias_is_asked_for(capsys):
     water = str(ROOT / "systems" / "water.toml")
-    more = ["--set", "stages.0.integrator=auto", "--set", "stages.0.bias_kT=1e-3"]
+    more = ["--set", "stages.equilibration.integrator=auto", "--set", "stages.equilibration.bias_kT=1e-3"]
     assert main(["check", water, *more]) == 0
     assert "for an error of 0.001 kT per degree of freedom of the average potential energy" in capsys.readouterr().out
 

@@ -166,7 +166,7 @@ def test_times_from_python_are_finite(time):
 
 def test_values_show_what_they_are(tmp_path):
     water = Scene.read(ROOT / "systems" / "water.toml")
-    assert repr(water) == "<MolecularScene water: 216 spce; nvt 10 ps, nve 20 ps>"
+    assert repr(water) == "<MolecularScene water: 216 spce; minimisation, equilibration 10 ps, production 20 ps>"
     assert "216 spce of structures/water216.gro" in repr(Scene.read(ROOT / "systems" / "water_from_structure.toml"))
     scene = Scene.read(TOP, SHORT)
     assert repr(scene) == "<BodyScene heavy_top_3: one body, pinned; 0.05 s in 100 steps of 0.0005 s, kahan_li_8>"
@@ -200,7 +200,7 @@ def test_values_show_what_they_are(tmp_path):
 
 SCRIPT = """import rigidmd
 
-scene = rigidmd.Scene.read("systems/water.toml", {"stages.0.duration_ps": 1.0})
+scene = rigidmd.Scene.read("systems/water.toml", {"stages.equilibration.duration_ps": 1.0})
 watch = rigidmd.Every(1.0, lambda moment: print(moment.time, moment.observation.temperature))
 simulation = rigidmd.Simulation(scene, "runs/water", observers=[watch, rigidmd.LivePlot("drift")])
 results = simulation.run(progress=True)

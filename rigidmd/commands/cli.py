@@ -22,7 +22,7 @@ EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
   rigidmd check water.toml                  describe the run without running it
   rigidmd run water.toml                    run it; results go to runs/water
-  rigidmd run water.toml --set stages.1.timestep_fs=4 -o runs/water4
+  rigidmd run water.toml --set stages.production.timestep_fs=4 -o runs/water4
   rigidmd energy water.toml --unit kcal/mol
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
   rigidmd help                              the chapters of the documentation

@@ -23,7 +23,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
 
 @command(
     130, "run a scene at many points, a folder each, with a table and a figure of means and errors",
-    "rigidmd sweep water.toml --set stages.0.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
+    "rigidmd sweep water.toml --set stages.equilibration.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
     "  rigidmd sweep water.toml --replicas 8\n"
     "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),

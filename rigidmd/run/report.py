@@ -113,7 +113,8 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     if stage["temperature_K"] is not None:
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
         rows.append(("temperature", _with_set_point(value, stage["set_temperature_K"], "K")))
-        rows.append(("", _temperatures(stage, "")))
+        if stage["temperature_rotation_K"] is not None:
+            rows.append(("", _temperatures(stage, "")))
         if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} without the error of the time step"))
         if (scatter := stage["temperature_scatter_K"]) is not None:

@@ -129,7 +129,7 @@ def sweep(
 ) -> Table:  # fmt: skip
     """Run a scene file at many points in parallel, and return the table of means and errors, as `rigidmd sweep` does.
 
-    table = rigidmd.sweep("water.toml", {"stages.0.temperature_K": [280, 290], "seed": range(1, 9)}, jobs=2)
+    table = rigidmd.sweep("water.toml", {"stages.equilibration.temperature_K": [280, 290], "seed": range(1, 9)}, jobs=2)
     print(table["Temperature (K)"], table.error("Temperature (K)"))
 
     sets : dotted key -> list, tuple or range of values, or one value for all points; all combinations run
