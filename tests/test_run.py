@@ -53,7 +53,7 @@ from support import (
 import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
-from rigidmd.run import Every, Observer, Simulation
+from rigidmd.run import Every, Observer, Simulation, run_together
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -449,6 +449,85 @@ def noted(*given, **made):
 
 
 KEPT = {"thermostat": "velocity_rescaling"}
+
+
+def test_means_are_over_the_equilibrated_part():
+    """An energy that relaxes in 5 ps, of 20; the temperature differs there."""
+    rng, time = np.random.default_rng(5), 0.05 * np.arange(400)
+    relaxing = np.exp(-time / 1.0)
+    potential = -1600 + 400 * relaxing + 10 * rng.standard_normal(400)
+    found = summarised(KEPT, potential=potential, temperature=300 + 80 * relaxing + rng.standard_normal(400))
+    stage = found["stages"][0]
+    begin = stage["equilibrated_from_ps"]
+    assert 2.5 < begin < 8
+    assert stage["means_over"] == f"the last {19.95 - begin:.4g} of 19.95 ps"
+    own = time > begin - 1e-9
+    assert stage["potential_kJ_mol_per_molecule"] == pytest.approx(potential[own].mean() / 40, rel=1e-12)
+    assert stage["potential_error_kJ_mol_per_molecule"] == pytest.approx(10 / np.sqrt(own.sum()) / 40, rel=0.4)
+    assert abs(stage["temperature_K"] - 300) < 4 * stage["temperature_error_K"] < 1
+    assert stage["temperature_translation_error_K"] == pytest.approx(1 / np.sqrt(own.sum()), rel=0.4)
+    text = summary_text(found)
+    assert f"means           over {stage['means_over']}" in text
+    assert "K, set point 300 K" in text
+    assert re.search(r"T_trans [\d.]+ ± [\d.]+, T_rot [\d.]+ ± [\d.]+ K\n", text)
+    assert re.search(r"potential +-4\d.\d+ ± 0.0\d+ kJ/mol per molecule", text)
+
+
+@pytest.mark.parametrize(("given", "potential", "words", "begins"), [
+    (KEPT, np.linspace(0.0, 1.0, 39), "all 1.9 ps, too short to detect equilibration", None),
+    (KEPT, np.zeros(100), "all 4.95 ps", 0.0),
+    (KEPT, np.linspace(0.0, 1e3, 100), "the last 2.45 of 4.95 ps, not yet steady", 2.5),
+    (KEPT | {"temperature_K": [300.0, 200.0]}, np.linspace(0.0, 1e3, 100),
+     "all 4.95 ps, in which the set point changes", 0.0),
+])  # fmt: skip
+def test_the_part_of_means_is_said(given, potential, words, begins):
+    stage = summarised(given, potential=potential)["stages"][0]
+    assert stage["means_over"] == words
+    assert stage["equilibrated_from_ps"] == (None if begins is None else pytest.approx(begins))
+
+
+@pytest.mark.parametrize(("slope", "noise", "verdict"), [
+    (0.0, 1e-3, r"not significant, [012].\d standard errors$"),
+    (1e-3, 1e-3, r"significant, \d+.\d standard errors, but small$"),
+    (10.0, 1e-3, r"significant, \d+.\d standard errors, and large$"),
+])  # fmt: skip
+def test_a_drift_has_a_verdict(slope, noise, verdict):
+    """The limit is 0.001 kT per degree of freedom: 0.6 kJ/mol for 40 waters in 20 ps, 0.03 kJ/mol/ps."""
+    drift = slope * 0.05 * np.arange(400) + noise * np.random.default_rng(3).standard_normal(400)
+    found = summarised(KEPT, drift=drift, temperature=np.full(400, 300.0))
+    assert re.match(verdict, found["stages"][0]["drift_verdict"])
+    assert f"(conserved energy): {found['stages'][0]['drift_verdict']}" in summary_text(found)
+    assert summarised(KEPT, drift=drift[:10])["stages"][0]["drift_verdict"] is None
+
+
+def test_constant_energy_after_a_thermostat_explains_its_temperature():
+    warm = {"ensemble": "npt", "temperature_K": [80.0, 100.0], "pressure_bar": 10.0, "duration_ps": 0.5}
+    stages = [{"ensemble": "minimise"}, warm, {"duration_ps": 1.0}, {"duration_ps": 0.1}]
+    results = Simulation(small_scene({"argon": 40}, 17.0, stages=stages, output={"log_interval_ps": 0.01})).run()
+    _, one, two, three = results.summary["stages"]
+    assert one["set_temperature_K"] == (80.0, 100.0) and one["temperature_scatter_K"] is None
+    assert three["temperature_scatter_K"] is None  # nothing was drawn at its start
+    steady = results["temperature"][(results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)]
+    square = 2 * steady.mean() ** 2 / 117 - steady.var()
+    assert two["temperature_scatter_K"] == pytest.approx(np.sqrt(square))
+    assert two["temperature_before_K"] == 100.0
+    text = summary_text(results.summary)
+    off = two["temperature_K"] - 100.0
+    assert f"{off:+.2g} K from the 100 K before: this stage keeps the energy of one moment; such" in text
+    assert ("equilibrate longer" in text) == (abs(off) > 3 * two["temperature_scatter_K"])
+    assert "set point 80 to 100 K" in text and "set point 10 bar" in text
+
+
+@pytest.mark.soak
+def test_temperatures_at_constant_energy_scatter_as_estimated():
+    stages = [{"ensemble": "nvt", "temperature_K": 100.0, "duration_ps": 15.0, "timestep_fs": 5.0},
+              {"duration_ps": 20.0, "timestep_fs": 5.0}]  # fmt: skip
+    sections = {"stages": stages, "output": {"trajectory": False, "log_interval_ps": 0.05}, "forces": {"cutoff_A": 8.0}}
+    runs = [Simulation(small_scene({"argon": 100}, 17.5, seed=seed, **sections), warn=str) for seed in range(1, 41)]
+    found = [results.summary["stages"][1] for results in run_together(runs) if results]
+    measured = np.std([stage["temperature_K"] for stage in found], ddof=1)
+    estimated = np.sqrt(np.mean([stage["temperature_scatter_K"] ** 2 for stage in found]))
+    assert measured == pytest.approx(estimated, rel=3 / np.sqrt(2 * 39))
 
 
 @pytest.mark.parametrize("thermostat", ["langevin", "andersen", "velocity_rescaling", "nose_hoover", None])

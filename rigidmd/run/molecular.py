@@ -370,6 +370,7 @@ class MolecularRun(RunPart):
         if short and self.engine.is_repeatable and not (self.segment.action or system.python_forces):
             state = good.copy()
             if state.step[ORIGIN] != self.state.step[ORIGIN]:  # it is the end of the stage before
+                scale_to_mean_box(system, state, self.samples(), self.record.position.segment)
                 state = self.engine.begin(state, method)
                 state.begin_segment()
             self.engine.forget()

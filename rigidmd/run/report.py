@@ -107,26 +107,25 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows = [("integrator", stage["choice"])] if stage["choice"] else []
     rows.append(("means", f"over {stage['means_over']}"))
     if stage.get("volume_nm3") is not None:
-        mean = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"])
-        rows.append(("volume", f"{mean} nm³, the mean of the stage before, at whose end it was "
-                               f"{stage['volume_before_nm3']:.4g} nm³"))  # fmt: skip
+        mean, end = format_with_error(stage["volume_nm3"], stage["volume_error_nm3"]), stage["volume_before_nm3"]
+        rows.append(("volume", f"{mean} nm³, the mean of the stage before, at whose end it was {end:.4g} nm³"))
     if stage["temperature_K"] is not None:
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
-        rows.append(("temperature", _with_set_point(value, stage["set_temperature_K"], "K")))
+        rows.append(("temperature", value + set_point(stage["set_temperature_K"], "K", ", set point ")))
         if stage["temperature_rotation_K"] is not None:
             rows.append(("", _temperatures(stage, "")))
         if parts := _temperatures(stage, "_unbiased"):
             rows.append(("", f"{parts} without the error of the time step"))
-        if (scatter := stage["temperature_scatter_K"]) is not None:
+        if (scatter := stage.get("temperature_scatter_K")) is not None:
             off, before = stage["temperature_K"] - stage["temperature_before_K"], stage["temperature_before_K"]
             moment = "this stage keeps the energy of one moment; such temperatures scatter by"
             more = "" if abs(off) < 3 * scatter else ", less than this: equilibrate longer"
-            rows.append(("", f"{off:+.2g} K from {before:g} K: {moment} {scatter:.2g} K{more}"))
+            rows.append(("", f"{off:+.2g} K from the {before:g} K before: {moment} {scatter:.2g} K{more}"))
     error = stage["potential_error_kJ_mol_per_molecule"]
     rows.append(("potential", _with_error(stage["potential_kJ_mol_per_molecule"], error, 3, "kJ/mol per molecule")))
     if stage["pressure_bar"] is not None:
         value = _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")
-        rows.append(("pressure", _with_set_point(value, stage["set_pressure_bar"], "bar")))
+        rows.append(("pressure", value + set_point(stage["set_pressure_bar"], "bar", ", set point ")))
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
         edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
@@ -142,10 +141,10 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if stage["drift_kT_ns_per_degree_of_freedom"] is not None:
             value, error = stage["drift_kT_ns_per_degree_of_freedom"], stage["drift_error_kT_ns_per_degree_of_freedom"]
             rows.append(("", f"{format_signed(value, error)} kT/ns per degree of freedom"))
-        if stage["drift_over_kinetic_std"] is not None and stage["drift_kT_per_degree_of_freedom"] is not None:
-            total = f"{stage['drift_kT_per_degree_of_freedom']:+.2g} kT per degree of freedom, "
-            deviations = f"{stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy"
-            rows.append(("", f"in total {total}{deviations}"))
+            total = f"in total {value * stage['duration_ps'] / 1000:+.2g} kT per degree of freedom"
+            if stage["drift_over_kinetic_std"] is not None:
+                total += f", {stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy"
+            rows.append(("", total))
         noise = stage["energy_rms_kJ_mol_per_molecule"]
         rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms about the line"))
     return rows
@@ -156,14 +155,12 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
     return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
-def set_point(value: float | Sequence[float] | None, unit: str) -> str:
-    """The set point of a thermostat or barostat; two values change over the stage. Empty without one."""
-    values = list(value) if isinstance(value, Sequence) else [] if value is None else [value]
-    return f"{(' to ' if len(values) == 2 else ', ').join(f'{each:g}' for each in values)} {unit}" if values else ""
-
-
-def _with_set_point(value: str, given: float | Sequence[float] | None, unit: str) -> str:
-    return value if given is None else f"{value}, set point {set_point(given, unit)}"
+def set_point(given: float | Sequence[float] | None, unit: str, before: str = "") -> str:
+    """The set point of a thermostat or barostat behind a text, two values if it changes; empty without one."""
+    if given is None:
+        return ""
+    values = given if isinstance(given, Sequence) else [given]
+    return f"{before}{(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
 
 
 def _temperatures(stage: dict, kind: str) -> str:

@@ -290,9 +290,9 @@ class MolecularScene(Scene):
             what = f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box"
             yield from [f"{what}, but {why}" for why, applies in reasons.items() if stage.changes_box and applies]
             before = self.stages[k - 1] if k else None
-            if stage.volume and not (before and before.has_barostat and not before.ramps):
-                found = "it is the first stage" if before is None else f"stages.{k - 1} is {before.ensemble}"
-                found += ", and its set point changes" if before is not None and before.has_barostat else ""
+            if stage.volume and (before is None or not before.has_barostat or before.ramps):
+                changes = ", and its set point changes" if before and before.ramps else ""
+                found = f"stages.{k - 1} is {before.ensemble}{changes}" if before else "it is the first stage"
                 why = "needs an npt or nph stage just before it, at constant temperature and pressure"
                 yield f"stages.{k}.volume = 'mean' {why}; {found}. Add one, or leave volume out"
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
