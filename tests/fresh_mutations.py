@@ -90,8 +90,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F13", "drift in kT: degrees of freedom without the total momentum where Langevin changes it",
         "run/summary.py",
-        "    thermal = BOLTZMANN / KJ_PER_MOL * (temperature[0] or 0.0) * system.freedom_in(k).total\n",
-        "    thermal = BOLTZMANN / KJ_PER_MOL * (temperature[0] or 0.0) * system.freedom.total\n",
+        '    thermal = BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom_in(k).total\n',
+        '    thermal = BOLTZMANN / KJ_PER_MOL * (temperatures["temperature_K"] or 0.0) * system.freedom.total\n',
         ("test_run.py::test_a_drift_is_told_in_the_thermal_energy_of_the_degrees_of_freedom_of_its_stage",),
     ),
     Mutation(
