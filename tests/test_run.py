@@ -38,6 +38,7 @@ from support import (
     describe,
     integrator_of_stage,
     log,
+    mean_and_error,
     minimise,
     molecular_observers,
     molecular_run,
@@ -462,11 +463,11 @@ def test_means_are_over_the_equilibrated_part():
     assert 2.5 < begin < 8
     assert stage["means_over"] == f"the last {19.95 - begin:.4g} of 19.95 ps"
     own = time > begin - 1e-9
-    assert stage["potential_kJ_mol_per_molecule"] == pytest.approx(potential[own].mean() / 40, rel=1e-12)
-    assert stage["potential_error_kJ_mol_per_molecule"] == pytest.approx(10 / np.sqrt(own.sum()) / 40, rel=0.4)
+    of_potential = stage["potential_kJ_mol_per_molecule"], stage["potential_error_kJ_mol_per_molecule"]
+    assert of_potential == pytest.approx(mean_and_error(potential[own] / 40), rel=1e-9)
     assert abs(stage["temperature_K"] - 300) < 4 * stage["temperature_error_K"] < 1
-    assert stage["temperature_translation_error_K"] == pytest.approx(1 / np.sqrt(own.sum()), rel=0.4)
-    text = summary_text(found)
+    assert stage["temperature_translation_error_K"] == pytest.approx(1 / np.sqrt(own.sum()), rel=0.5)
+    text = summary_text(found | {"scene": "made up"})
     assert f"means           over {stage['means_over']}" in text
     assert "K, set point 300 K" in text
     assert re.search(r"T_trans [\d.]+ ± [\d.]+, T_rot [\d.]+ ± [\d.]+ K\n", text)
@@ -496,17 +497,17 @@ def test_a_drift_has_a_verdict(slope, noise, verdict):
     drift = slope * 0.05 * np.arange(400) + noise * np.random.default_rng(3).standard_normal(400)
     found = summarised(KEPT, drift=drift, temperature=np.full(400, 300.0))
     assert re.match(verdict, found["stages"][0]["drift_verdict"])
-    assert f"(conserved energy): {found['stages'][0]['drift_verdict']}" in summary_text(found)
+    assert f"(conserved energy): {found['stages'][0]['drift_verdict']}" in summary_text(found | {"scene": "made up"})
     assert summarised(KEPT, drift=drift[:10])["stages"][0]["drift_verdict"] is None
 
 
 def test_constant_energy_after_a_thermostat_explains_its_temperature():
     warm = {"ensemble": "npt", "temperature_K": [80.0, 100.0], "pressure_bar": 10.0, "duration_ps": 0.5}
     stages = [{"ensemble": "minimise"}, warm, {"duration_ps": 1.0}, {"duration_ps": 0.1}]
-    results = Simulation(small_scene({"argon": 40}, 17.0, stages=stages, output={"log_interval_ps": 0.01})).run()
+    results = Simulation(small_scene({"argon": 40}, 19.0, stages=stages, output={"log_interval_ps": 0.01})).run()
     _, one, two, three = results.summary["stages"]
-    assert one["set_temperature_K"] == (80.0, 100.0) and one["temperature_scatter_K"] is None
-    assert three["temperature_scatter_K"] is None  # nothing was drawn at its start
+    assert one["set_temperature_K"] == (80.0, 100.0) and "temperature_scatter_K" not in one
+    assert "temperature_scatter_K" not in three  # nothing was drawn at its start
     steady = results["temperature"][(results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)]
     square = 2 * steady.mean() ** 2 / 117 - steady.var()
     assert two["temperature_scatter_K"] == pytest.approx(np.sqrt(square))
