@@ -286,4 +286,18 @@ FRESH: list[Mutation] = [
         "            self.state.energy_ledger[REMOVED] += remove_momentum(",
         ("test_thermostats.py::test_degrees_of_freedom_follow_the_thermostat",),
     ),
+    Mutation(
+        "F41", "a stage in the mean box: the energy of the scaling is not booked",
+        "run/mean_box.py",
+        "    state.energy_ledger[WORK] += observe(system, engine, state, energy_unit=1.0).potential - before\n",
+        "    state.energy_ledger[WORK] += 0.0 * before\n",
+        ("test_mean_box.py::test_the_energy_of_the_scaling_is_work_and_no_drift",),
+    ),
+    Mutation(
+        "F42", "means of a summary: over the whole stage",
+        "run/summary.py",
+        "    steady = equilibrated(of_stage, stage)\n",
+        "    steady = of_stage\n",
+        ("test_run.py::test_means_are_over_the_equilibrated_part",),
+    ),
 ]  # fmt: skip

@@ -92,6 +92,8 @@ def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.nda
         line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
         axis.plot(time[last], line, color=WARM, lw=1.4)
         title = f"{summary['name']}: drift {format_signed(gradient, error)} kJ/mol/ns per molecule"
+        if verdict := summary.get("drift_verdict"):
+            title += f": {verdict.partition(',')[0]}"
         axis.set_title(title, loc="left", fontsize=9, color=WARM)
     axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
 

@@ -223,6 +223,7 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     first = before.row(-1) if len(before) else of_stage.row(0)
     stage = system.scene.stages[k]
     steady = equilibrated(of_stage, stage)
+    begin = steady.row(0).time if len(steady) < len(of_stage) else first.time
     n, steps = len(system.model.species), of_stage.row(-1).step - first.step
     speed = steps / computing if computing > 0 else None
     time, drift = of_stage["time"], of_stage["drift"]
@@ -237,7 +238,7 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
         "timestep_fs": stage.timestep_fs, "steps": steps, "duration_ps": duration, "computing_s": computing,
         "steps_per_s": speed, "ns_per_day": speed * stage.timestep_fs * 1e-6 * 86400 if speed else None,
         "means_over": describe_equilibrated(of_stage, stage, first.time),
-        "equilibrated_from_ps": float(steady["time"][0]) if len(time) >= LEAST_SAMPLES else None,
+        "equilibrated_from_ps": begin if len(time) >= LEAST_SAMPLES else None,
         "set_temperature_K": stage.temperature_K, "set_pressure_bar": stage.pressure_bar,
         **temperatures, "potential_kJ_mol_per_molecule": potential[0],
         "potential_error_kJ_mol_per_molecule": potential[1],
