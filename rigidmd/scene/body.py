@@ -328,7 +328,7 @@ class BodyScene(Scene):
     """One body that moves."""
 
     body: BodyTable
-    start: BodyStart = BodyStart()
+    start: BodyStart = BodyStart.model_construct()
     gravity: Gravity | None = None
     applied: tuple[Applied, ...] = Field(default=(), max_length=MOST_TABLES)
     friction: Friction | None = None
@@ -337,8 +337,8 @@ class BodyScene(Scene):
     wheels: tuple[Wheel, ...] = Field(default=(), max_length=MOST_TABLES)
     changing_inertia: ChangingInertia | None = None
     run: Run
-    output: BodyOutput = BodyOutput()
-    watch: BodyWatch = BodyWatch()
+    output: BodyOutput = BodyOutput.model_construct()
+    watch: BodyWatch = BodyWatch.model_construct()
 
     @property
     def in_short(self) -> str:

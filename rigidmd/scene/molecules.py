@@ -173,17 +173,17 @@ class MolecularScene(Scene):
     """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""
-    engine: EngineChoice = EngineChoice()
+    engine: EngineChoice = EngineChoice.model_construct()
     structure: Structure | None = None
-    box: Box = Box()
+    box: Box = Box.model_construct()
     molecules: tuple[Molecules, ...] = Field(min_length=1, max_length=MOST_TABLES)
-    forces: Forces = Forces()
-    fields: Fields = Fields()
-    start: Start = Start()
+    forces: Forces = Forces.model_construct()
+    fields: Fields = Fields.model_construct()
+    start: Start = Start.model_construct()
     stages: tuple[Stage, ...] = Field(min_length=1, max_length=MOST_TABLES)
-    run: RunSettings = RunSettings()
-    output: Output = Output()
-    watch: Watch = Watch()
+    run: RunSettings = RunSettings.model_construct()
+    output: Output = Output.model_construct()
+    watch: Watch = Watch.model_construct()
     from_python: tuple[str, ...] = Field(default=(), max_length=MOST_TABLES)
     """Names of forces and a thermostat that Python added, set by the run. Such a scene runs only from Python, with the
     same forces and thermostat"""
