@@ -70,7 +70,7 @@ class RigidMD(Calculator):
     bend : largest distance of an atom from its position in a rigid molecule without a warning, over the molecule's
         radius
     tolerance : the same without an error
-    precision : "double" or "mixed"
+    precision : "double", the default, or "mixed"
     fields : the table [fields] of a scene file
     forces : keys of the table [forces]: cutoff_A, electrostatics, truncation, ...
 

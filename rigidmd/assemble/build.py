@@ -14,6 +14,7 @@ from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
+from rigidmd.assemble.time_step import with_precision
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import state_of
 from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
@@ -46,10 +47,11 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
     cell = "" if start.cell is None else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    resolved = with_defaults(scene, Composition(species, counts, space, start.basis, cell))
+    resolved = with_defaults(scene, Composition(species, counts, space, start.basis, cell, start.position))
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
     scene = resolved.scene
+    velocity = start.velocity if scene.structure is not None and scene.structure.velocities else None
     mass, inertia = np.array([m.mass for m in species]), np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
     model = Model(
@@ -61,6 +63,9 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
         cell=start.cell,
     )
+    kinetic = 0.0 if velocity is None else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
+    free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
+    scene, precision_reason = with_precision(scene, free, kinetic / BOLTZMANN)
     parts = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
     acting = interactions(parts)
     acting.terms.update(field_terms(parts))
@@ -70,8 +75,8 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
         freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,
         tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
-        left_out=left_out(scene, acting.terms, model, space),
-        force_error=acting.force_error,
+        left_out=left_out(scene, acting.terms, model, space, any(m.charges.any() for m in species)),
+        precision_reason=precision_reason, force_error=acting.force_error,
         notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )  # fmt: skip
     if user_code:
@@ -159,16 +164,15 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
     return moved
 
 
-def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> list[str]:
-    """What is not compiled for this scene, and why."""
+def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space, charged: bool) -> list[str]:
+    """What is not compiled for this scene, and why. charged : whether a site has a charge"""
     forces, has_images, removal = scene.forces, "coulomb_reciprocal" in terms, scene.run.remove_momentum_interval_ps
     method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
-    no_charges = "electrostatics is none" if method == "none" else "no site has one"
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
         for key, (title, without) in POTENTIALS.items()
     } | {
-        f"charges: {no_charges}": not has_charges,
+        f"charges: {'electrostatics is none' if charged else 'no site has one'}": not has_charges,
         f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_images,
         "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": has_images and method == "ewald",
         "rotation and torques: every molecule is a point": isinstance(model.rotor, NoRotor),
@@ -176,7 +180,7 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space) -> 
         "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
         "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
         "removal of the total momentum: run.remove_momentum_interval_ps is false": removal is False,
-        "tail correction: not requested": not forces.tail_correction,
+        "tail correction: only by default in a periodic box that molecules fill evenly": not forces.tail_correction,
     }  # fmt: skip
     fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]
     return [

@@ -14,13 +14,13 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from rigidmd.core.integrators import RK4, SOLVERS
-from rigidmd.forces.neighbors.space import Triclinic
+from rigidmd.forces.neighbors.space import Triclinic, cell_of
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
 from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.body import FORMULATION, SAMPLES
-from rigidmd.scene.forces import ELECTROSTATICS, Forces
+from rigidmd.scene.forces import ELECTROSTATICS, OPEN, PERIODIC, Forces
 
 CUTOFF = 9.0  # Å, in a periodic box
 #: Default with PME, ps. PME forces do not add up to zero exactly: in 1 ps 216 waters at an accuracy of 1e-4 gained a
@@ -49,9 +49,6 @@ def with_engine_defaults(scene: MolecularScene) -> tuple[MolecularScene, list[st
             found["barostat"] = program.barostat
         stages.append(stage.model_copy(update=found))
     changed: dict[str, Any] = {"stages": tuple(stages)}
-    forces = scene.forces
-    if "ewald_truncation" in ELECTROSTATICS[forces.electrostatics].keys and forces.ewald_truncation is None:
-        changed["forces"] = forces.model_copy(update={"ewald_truncation": "plain"})
     if scene.run.remove_momentum_interval_ps is None:
         changed["run"] = scene.run.model_copy(update={"remove_momentum_interval_ps": False})
     return scene.model_copy(update=changed), notes
@@ -67,11 +64,13 @@ class SceneWithDefaults(NamedTuple):
 
 
 def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithDefaults:
-    """A scene of molecules with all defaults except `with_momentum_removal`."""
-    numbers, faults = _cutoff_and_switch(scene.forces, composition)
+    """A scene of molecules with all defaults except `with_momentum_removal` and `with_precision`."""
+    scene, faults = _with_electrostatics(scene, composition)
+    numbers, more = _cutoff_and_switch(scene.forces, composition)
+    faults += more
     found, of_method = Settings({}, faults), getattr(electrostatics_module(scene.forces), "settings", None)
     if not faults and of_method is not None:
-        found = of_method(scene.forces, composition, numbers["cutoff_A"])
+        found = of_method(scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external)
         faults = found.errors
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
         why = "without which the pressure is not defined"
@@ -111,9 +110,39 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
 
 
+def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tuple[MolecularScene, list[str]]:
+    """A scene with its method of electrostatics, tail correction and cutoff scheme of charges, and error messages."""
+    forces, faults = scene.forces, []
+    method = forces.electrostatics
+    if method is None:
+        has_charges = any(m.charges.any() for m in composition.species)
+        method = (PERIODIC if composition.space.volume < inf else OPEN) if has_charges else "none"
+        faults += [f"forces.{message}" for message in forces.idle_keys(method)]
+    numbers: dict[str, Any] = {"electrostatics": method}
+    if method == "reaction_field" and forces.reaction_field_truncation is None:
+        like = forces.truncation in ("plain", "smooth_switch")
+        numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
+    if forces.tail_correction is None:
+        other = scene.fields.walls or any(m.frozen for m in scene.molecules)
+        other |= scene.engine.is_external and any(stage.has_barostat for stage in scene.stages)
+        numbers["tail_correction"] = forces.lennard_jones and not other and is_homogeneous(composition)
+    return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), faults
+
+
+def is_homogeneous(composition: Composition) -> bool:
+    """Whether molecules fill a periodic box evenly. A slab or a droplet leaves a part of an edge without any centre of
+    mass, longer than two distances between neighbours, (V/n)^(1/3)."""
+    space, position = composition.space, composition.position
+    if space.volume == inf:
+        return False
+    fraction = np.sort(position @ np.linalg.inv(cell_of(space)) % 1.0, axis=0)
+    gap = np.diff(fraction, axis=0, append=fraction[:1] + 1.0).max(axis=0) * space.edges
+    return bool(gap.max() <= 2 * (space.volume / len(position)) ** (1 / 3))
+
+
 def electrostatics_module(forces: Forces) -> ModuleType | None:
     """The module of `forces` with the method of electrostatics; None for electrostatics = "none"."""
-    name = ELECTROSTATICS[forces.electrostatics].module
+    name = ELECTROSTATICS[forces.electrostatics or "none"].module
     return import_module(f"rigidmd.forces.{name}") if name else None
 
 
@@ -124,10 +153,12 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
     cutoff, start, faults = given or inf, forces.switch_start_A, []
     half = min(space.edges) / 2
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
-    if cutoff > half:
-        default = "" if forces.cutoff_A else " (the default)"
+    for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
+        if not value > half:
+            continue
+        default = "" if getattr(forces, key) else " (the default)"
         faults.append(
-            f"forces.cutoff_A = {cutoff:g}{default} is longer than half {least} of the box, {half:.3f} Å, "
+            f"forces.{key} = {value:g}{default} is longer than half {least} of the box, {half:.3f} Å, "
             "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
         )
     for m in composition.species:
@@ -140,8 +171,9 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
         faults.append("forces.tail_correction needs a periodic box, filled by a uniform liquid beyond the cutoff")
     if (of_method := getattr(electrostatics_module(forces), "setting_errors", None)) is not None:
         faults += of_method(forces, space, cutoff)
-    if start is None and cutoff < inf and "switch" in forces.truncation:
-        start = default_switch_start(forces.truncation, cutoff)
+    if start is None and cutoff < inf:
+        schemes = (forces.truncation, forces.reaction_field_truncation or "")
+        start = next((default_switch_start(name, cutoff) for name in schemes if "switch" in name), None)
     return {"cutoff_A": given, "switch_start_A": start}, faults
 
 

@@ -9,6 +9,7 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
+from rigidmd.assemble.time_step import MIXED_ERROR
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
@@ -16,20 +17,19 @@ from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
+from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.io.formats.cells import right_angled
 from rigidmd.mechanics.free_rotor import NoRotor
 from rigidmd.mechanics.rotation import to_euler_angles
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
+from rigidmd.units import BAR, KJ_PER_MOL
 
-#: Rms error of forces in mixed precision, relative to the rms force. Measured for a liquid with a cutoff of 9 Å: 3.2e-6
-#: for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field, 1.4e-6 for 500 argon; the largest 1e-5.
-MIXED_ERROR = "3e-6"
 #: Precision of forces, for reports. Times: docs/benchmarks.md.
 PRECISIONS = {
-    "double": f'double precision (precision = "mixed" takes about half the time; forces have errors of {MIXED_ERROR})',
-    "mixed": f"mixed precision: single between sites, with errors of forces of {MIXED_ERROR}, else double",
+    "double": f'double precision (precision = "mixed" takes half the time; forces have errors of {MIXED_ERROR:.0e})',
+    "mixed": f"mixed precision: single between sites, with errors of forces of {MIXED_ERROR:.0e}, else double",
 }
 
 
@@ -98,6 +98,10 @@ def _describe_molecules(system: System) -> str:
         of_field = fields[name][0].sentence(fields[name][1], term) if name in fields else ""
         description = system.user_terms.get(name) or of_field or _describe_term(system, term)
         lines.append(f"  {name.replace('_', ' ')}: {description}")
+    if system.tail is not None:
+        energy = system.tail.energy(system.space.volume) / KJ_PER_MOL / len(system.model.species)
+        pressure = system.tail.pressure(system.space.volume) / BAR
+        lines.append(f"  tail correction: {energy:.4g} kJ/mol per molecule and {pressure:.4g} bar at this volume")
     if not isinstance(system.model.rotor, NoRotor):
         lines.append(f"  rotation: {type(system.model.rotor).__name__}")
     if system.thermostat is not None:
@@ -120,8 +124,14 @@ def _describe_molecules(system: System) -> str:
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
     if not scene.engine.is_external:
         threads = usable_threads(scene.threads)
-        lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {PRECISIONS[scene.precision]}")
+        how = describe_precision(system) if system.precision_reason else PRECISIONS[scene.precision]
+        lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {how}")
     return "\n".join(lines)
+
+
+def describe_precision(system: System) -> str:
+    """The precision of forces that "auto" has chosen, and why."""
+    return f"{system.scene.precision} precision, chosen because {system.precision_reason}"
 
 
 def _describe_term(system: System, term: NamedTuple) -> str:
@@ -130,5 +140,7 @@ def _describe_term(system: System, term: NamedTuple) -> str:
     cutoff: float = term.potential.cutoff  # type: ignore[attr-defined]  # every pair potential has a cutoff
     reach = f"cutoff {cutoff:g} Å" if cutoff < inf else "no cutoff"
     if cutoff < inf and hasattr(term.potential, "truncation"):
-        reach += f", {system.scene.forces.truncation}"
+        forces = system.scene.forces
+        of_charges = isinstance(term.potential, ReactionField)
+        reach += f", {forces.reaction_field_truncation if of_charges else forces.truncation}"
     return f"{len(term.group)} sites, {reach}, neighbour list with a skin of {system.scene.forces.skin_A:g} Å"

@@ -7,7 +7,7 @@ from rigidmd.commands.streams import warn
 @command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine)
 def _check(options: Options) -> int:
     from rigidmd.assemble.describe import describe
-    from rigidmd.run.pilot.stable_step import step_warnings
+    from rigidmd.assemble.time_step import step_warnings
     from rigidmd.scene import BodyScene, MolecularScene
 
     scene = read_scene(options)

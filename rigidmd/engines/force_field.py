@@ -65,7 +65,7 @@ class ForceFieldView(NamedTuple):
     @property
     def is_truncated(self) -> bool:
         """Whether `truncation` matters."""
-        return self.system.cutoff < inf and bool(self.lennard_jones or isinstance(self.coulomb, ReactionField))
+        return self.system.cutoff < inf and self.lennard_jones is not None
 
     @property
     def has_barostat(self) -> bool:
@@ -74,7 +74,7 @@ class ForceFieldView(NamedTuple):
     @property
     def electrostatics(self) -> str:
         """The electrostatics of the scene; "none" if no site has a charge."""
-        return "none" if self.coulomb is None else self.scene.forces.electrostatics
+        return (self.scene.forces.electrostatics or "none") if self.coulomb else "none"
 
     @property
     def has_ewald_sum(self) -> bool:

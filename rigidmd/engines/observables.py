@@ -152,7 +152,7 @@ def describe_quantities(system: System) -> dict[str, str]:
 
 
 def _describe_reaction_field(system: System) -> dict[str, str]:
-    name = system.scene.forces.truncation
+    name = system.scene.forces.reaction_field_truncation or ""
     shape = cast(ReactionField, cast(PairForces, system.terms["coulomb"]).potential).truncation
     start = 0.0 if isinstance(shape, Unmodified) else shape.start
     ends = {

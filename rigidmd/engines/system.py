@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class System:
     residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
     from_lattice: bool
     left_out: list[str]
+    precision_reason: str = ""  # where the scene has precision = "auto"
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
     python_forces: dict[str, Callable] = field(default_factory=dict)  # name of a term that Python computes -> function
@@ -144,8 +145,13 @@ class System:
         """Residue name of each molecule (n,) in topology files."""
         return np.array([m.residue_names[0] for m in self.species], dtype=object)[self.model.species]
 
+    @property
+    def precision(self) -> Precision:
+        """Of forces; a resolved scene has no "auto"."""
+        return cast(Precision, self.scene.precision)
+
     def engine(self) -> CpuEngine:
-        return self.engine_of(self.terms, self.scene.precision)
+        return self.engine_of(self.terms, self.precision)
 
     def engine_of(self, terms: dict[str, NamedTuple], precision: Precision) -> CpuEngine:
         """A new engine for this system with the given terms."""

@@ -106,6 +106,7 @@ class Composition(NamedTuple):
     space: Space
     basis: np.ndarray  # see `SystemParts`
     cell: str  # the cell of the box in terms of the given cell, for messages
+    position: np.ndarray  # (n, 3) centres of mass at the start
 
     @property
     def charges(self) -> Charges:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.body import build_body
+from rigidmd.assemble.time_step import stable_angle
 from rigidmd.compile.cache import describe_cache
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
@@ -27,7 +28,7 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import fastest_body_rate, stable_angle
+from rigidmd.run.pilot.stable_step import fastest_body_rate
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
 from rigidmd.run.schedule import Segment

@@ -21,6 +21,7 @@ from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.mechanics.rotation import from_vector
+from rigidmd.scene.validation import not_none
 from rigidmd.units import COULOMB, KJ_PER_MOL
 
 if TYPE_CHECKING:
@@ -62,22 +63,21 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     """Estimated rms error of Coulomb forces in another cell (3, 3), u Å/ps², with the Ewald sums of a system."""
     term, volume = system.terms["coulomb_reciprocal"], abs(float(np.linalg.det(cell)))
     counts = np.bincount(system.model.species, minlength=len(system.species))
-    charges = charges_in(system.species, counts)
+    charges, cutoff = charges_in(system.species, counts), not_none(system.scene.forces.ewald_cutoff_A)
     if isinstance(term, EwaldSum):
         reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
     else:
         term = cast("Pme", term)
         reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
-    return float(np.hypot(real_error(charges, term.alpha, system.cutoff, volume), reciprocal)) * COULOMB
+    return float(np.hypot(real_error(charges, term.alpha, cutoff, volume), reciprocal)) * COULOMB
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
-    """Relative rms errors of forces and torques with `precision = "mixed"`; None in double precision."""
-    scene = system.scene
-    if scene.precision == "double":
+    """Relative rms errors of forces and torques with `precision = "mixed"`; None for a scene with "double"."""
+    if system.precision == "double" and not system.precision_reason:
         return None
     exact = system.engine_of(system.terms, "double").evaluate(state)[0]
-    found = system.engine().evaluate(state)[0]
+    found = system.engine_of(system.terms, "mixed").evaluate(state)[0]
     sizes = [(float(np.linalg.norm(a - b)), float(np.linalg.norm(b))) for a, b in zip(found, exact, strict=True)]
     force, torque = (error / size if size > 0 else 0.0 for error, size in sizes)
     return force, torque
@@ -86,7 +86,7 @@ def single_precision_errors(system: System, state: State) -> tuple[float, float]
 def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     """Coulomb forces on charged sites (s, 3) without pairs inside molecules, and the Coulomb energy."""
     charged = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
-    engine = system.engine_of(charged, system.scene.precision)
+    engine = system.engine_of(charged, system.precision)
     _, tallies = engine.evaluate(state)
     real, force = cast(PairForces, system.terms["coulomb_real"]), np.zeros((system.site_count, 3))
     for name in ("coulomb_real", "coulomb_reciprocal"):

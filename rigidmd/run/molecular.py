@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build, integrator_of_stage
+from rigidmd.assemble.time_step import stable_angle
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.compile.cache import describe_cache
 from rigidmd.compile.machine import usable_threads
@@ -33,7 +34,7 @@ from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
 from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stable_angle, stiffest_mode
+from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
 from rigidmd.run.schedule import Segment
@@ -395,6 +396,8 @@ class MolecularRun(RunPart):
 
         measure_accuracy : also the errors of Coulomb forces against a more accurate Ewald sum
         """
+        if self._start.precision_reason:  # precision = "auto" is for runs
+            self._start = replace(self._start, scene=self._start.scene.model_copy(update={"precision": "double"}))
         removal = self.start()
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0)

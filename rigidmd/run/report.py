@@ -22,7 +22,8 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
     for stage in summary["stages"]:
         lines += ["", stage_title(stage), *_as_lines(stage_rows(stage))]
     momentum = f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the sum of |m v|"
-    rows = [_orthogonality(summary), ("momentum", momentum)]
+    rows = [("precision", summary["precision_reason"])] if summary["precision_reason"] else []
+    rows += [_orthogonality(summary), ("momentum", momentum)]
     if removed := summary["momentum_removed"]:
         rows.append(("", f"removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"))
     if summary["positions"]:

@@ -91,6 +91,7 @@ def summarise(
         "box_A": list(system.space) if system.density else None, "density_g_cm3": system.density or None,
         "cutoff_A": system.cutoff if np.isfinite(system.cutoff) else None,
         "positions": scene.output.positions if scene.output.trajectory and system.density else None,
+        "precision_reason": f"{system.precision}: {system.precision_reason}" if system.precision_reason else None,
         "relief_steps": record.removal.steps if record.removal else 0,
         "preparing_s": preparing, "wall_s": wall,
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()), "momentum_u_A_ps": last.momentum,

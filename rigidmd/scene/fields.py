@@ -192,7 +192,7 @@ def field_notes(scene: "MolecularScene") -> list[str]:
         f"fields.walls: {method} includes the periodic images beyond the walls, which act on the layer between the "
         "walls across the empty part of the box; a longer box reduces this effect"
     )
-    return [note] if scene.fields.walls and ELECTROSTATICS[method].sums_images else []
+    return [note] if scene.fields.walls and method and ELECTROSTATICS[method].sums_images else []
 
 
 def field_errors(scene: "MolecularScene") -> Iterator[str]:

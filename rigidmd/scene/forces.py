@@ -1,5 +1,6 @@
 """The table [forces] of a scene of molecules: forces between sites."""
 
+from collections.abc import Iterator
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -24,16 +25,19 @@ class Method(NamedTuple):
     conserves_momentum: bool = True
 
 
-_EWALD = ("ewald_accuracy", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_truncation")
+_EWALD = ("ewald_accuracy", "ewald_cutoff_A", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_truncation")
 _K_VECTORS = ("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")
 #: Value of `electrostatics` -> the method.
 ELECTROSTATICS = {
-    "reaction_field": Method("potentials.coulomb", ("reaction_field_permittivity",)),
+    "reaction_field": Method("potentials.coulomb", ("reaction_field_permittivity", "reaction_field_truncation")),
     "ewald": Method("ewald.interactions", (*_EWALD, *_K_VECTORS), sums_images=True),
     "pme": Method("ewald.interactions", (*_EWALD, "pme_order", "pme_grid"), True, conserves_momentum=False),
     "damped_shifted_force": Method("potentials.screened_coulomb", ("damping_per_A",)),
+    "coulomb": Method("potentials.coulomb"),
     "none": Method(),
 }
+#: Defaults of `electrostatics` where sites have charges, in a periodic box and in an open one.
+PERIODIC, OPEN = "pme", "coulomb"
 #: Pair potentials that are not of charges: key of `Forces`, which also names the term and the module in
 #: `forces.potentials` with the function `interactions` -> its name in the list of what a scene leaves out, and why.
 POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
@@ -114,9 +118,8 @@ class Forces(Section):
     cutoff_A: Positive | None = None
     """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
     truncation: Truncation = "switch"
-    """Cutoff scheme of Lennard-Jones and Coulomb forces; smooth_switch suits integrators of high order. The energy of a
-    reaction field is first shifted to 0 at the cutoff, then multiplied by switch or smooth_switch. The real-space part
-    of ewald and pme follows ewald_truncation"""
+    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of high order. Charges follow
+    reaction_field_truncation and ewald_truncation"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that is larger. Where
     smooth_switch begins; default: at 0.6 of the cutoff"""
@@ -128,17 +131,27 @@ class Forces(Section):
     """Lennard-Jones parameters of particular pairs, in place of the mixing rule"""
     custom: tuple[CustomForce, ...] = Field(default=(), max_length=MOST_TABLES)
     """Custom forces"""
-    tail_correction: Flag = False
-    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not"""
-    electrostatics: Literal[tuple(ELECTROSTATICS)] = "reaction_field"  # type: ignore[valid-type]
-    """Coulomb forces: ewald and pme act on all periodic images, the others within the cutoff; none ignores charges"""
+    tail_correction: Flag | None = None
+    """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not.
+    Default: true in a periodic box that the molecules fill evenly, false with walls, frozen molecules or empty space"""
+    electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
+    """Coulomb forces: ewald and pme act on all periodic images, reaction_field and damped_shifted_force within the
+    cutoff, coulomb on all pairs without a periodic box; none ignores charges. Default: pme in a periodic box, coulomb
+    in an open one"""
     reaction_field_permittivity: Permittivity = inf
     """Permittivity of the continuum beyond the cutoff; inf for a conductor"""
+    reaction_field_truncation: Truncation | None = None
+    """Cutoff scheme of charges with a reaction field. A conductor's field leaves no force at the cutoff, so that a
+    shifted energy suffices. switch and smooth_switch multiply the shifted energy; they make the random walk of the
+    energy smaller and steps slower. Default: plain or smooth_switch if `truncation` is, else shift"""
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Damping of damped_shifted_force; 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
     """Of ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets the
-    keys below; default: 1e-5"""
+    keys below; default: 5e-5, somewhat better than the defaults of GROMACS and OpenMM"""
+    ewald_cutoff_A: Positive | None = None
+    """Of ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a step fastest, by a model
+    of its cost, else cutoff_A"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: KIndex | tuple[KIndex, KIndex, KIndex] | None = None
@@ -162,12 +175,9 @@ class Forces(Section):
     """Extra radius of the neighbour list; affects only the speed"""
 
     def _errors(self):
-        if self.switch_start_A is not None and "switch" not in self.truncation:
+        if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
             yield f"switch_start_A would do nothing with truncation = {self.truncation!r}"
-        fields, used = type(self).model_fields, ELECTROSTATICS[self.electrostatics].keys
-        for key in dict.fromkeys(key for method in ELECTROSTATICS.values() for key in method.keys):
-            if key not in used and getattr(self, key) != fields[key].default:
-                yield f"{key} would do nothing with electrostatics = {self.electrostatics!r}"
+        yield from self.idle_keys(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
@@ -175,6 +185,14 @@ class Forces(Section):
         determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
+
+    def idle_keys(self, method: str) -> Iterator[str]:
+        """Messages on keys that do nothing with a method of electrostatics."""
+        default = "" if self.electrostatics else " (the default)"
+        for key in dict.fromkeys(key for other in ELECTROSTATICS.values() for key in other.keys):
+            idle = key not in ELECTROSTATICS[method].keys
+            if idle and getattr(self, key) != type(self).model_fields[key].default:
+                yield f"{key} would do nothing with electrostatics = {method!r}{default}"
 
     @property
     def sets_k_vectors(self) -> bool:

@@ -147,7 +147,7 @@ class Settings(TypedDict, total=False):
 
     name: str
     seed: int
-    precision: Literal["double", "mixed"]
+    precision: Literal["auto", "double", "mixed"]
     threads: int
     engine: dict[str, Any]
     structure: dict[str, Any]
@@ -169,8 +169,9 @@ class MolecularScene(Scene):
 
     seed: Annotated[int, Strict(), Field(ge=0)] = 1
     """Seed of all random numbers"""
-    precision: Literal["double", "mixed"] = "double"
-    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double"""
+    precision: Literal["auto", "double", "mixed"] = "auto"
+    """Arithmetic of the forces between sites; mixed: pairs in single precision, sums and motion in double; auto: mixed
+    where the error of the time step hides that of single precision, else double. Minimisations are in double"""
     threads: Count | None = None
     """Number of threads; default: all cores. Results do not depend on it"""
     engine: EngineChoice = EngineChoice.model_construct()

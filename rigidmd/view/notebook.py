@@ -38,7 +38,8 @@ STYLE = read_asset("notebook.css")
 ACTING = {"gravity": "gravity", "applied": "applied forces", "friction": "friction", "fluid": "a fluid",
           "frame": "a moving frame", "wheels": "wheels", "changing_inertia": "changing inertia"}  # fmt: skip
 COULOMB = {"reaction_field": "reaction field", "ewald": "Ewald sum", "pme": "particle mesh Ewald",
-           "damped_shifted_force": "damped shifted force", "none": "charges ignored"}  # fmt: skip
+           "damped_shifted_force": "damped shifted force", "coulomb": "Coulomb", "none": "charges ignored",
+           None: "particle mesh Ewald or, without a box, Coulomb"}  # fmt: skip
 USER_FORCES = "user forces"
 
 TableRow = tuple[str, str]

@@ -175,7 +175,8 @@ def _coulomb(view: ForceFieldView) -> dict[str, object]:
     found: dict[str, object] = {"coulombtype": TRANSLATIONS.of("forces.electrostatics")[view.electrostatics]}
     if isinstance(law, ScreenedCoulomb) and isinstance(mesh, Pme):
         found["coulomb-modifier"] = "Potential-shift" if law.shift else "None"
-        found["ewald-rtol"] = f"{float(erfc(law.alpha * law.cutoff)):.12g}"
+        # GROMACS needs one cutoff; rtol is that of alpha there
+        found["ewald-rtol"] = f"{float(erfc(law.alpha * view.system.cutoff)):.12g}"
         found |= {f"fourier-n{axis}": n for axis, n in zip("xyz", mesh.grid, strict=True)} | {"pme-order": mesh.order}
     elif isinstance(law, ReactionField):
         permittivity = view.system.scene.forces.reaction_field_permittivity

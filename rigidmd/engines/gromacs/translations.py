@@ -30,6 +30,7 @@ TRANSLATIONS = Translations(
         }, matters=lambda view: view.lennard_jones),
         Key("forces.electrostatics", {"none": "Cut-off", "reaction_field": "Reaction-Field", "pme": "PME"},
             matters=lambda view: view.coulomb),
+        Key("forces.reaction_field_truncation", {None: "", "plain": "None", "shift": "Potential-shift"}),
         Key("forces.ewald_truncation", {None: "", "plain": "None", "shift": "Potential-shift"}),
     ),
     stage=(
@@ -47,11 +48,6 @@ TRANSLATIONS = Translations(
     limits=(
         Limit("no box or no cutoff: GROMACS computes pairs within a cutoff in a periodic box",
             lambda view: not view.is_periodic or view.system.cutoff == inf),
-        Limit(
-            "forces.truncation = {!r} with reaction_field: GROMACS has plain and shift for it; use one of them, or pme",
-            lambda view: view.electrostatics == "reaction_field" and view.truncation not in ("plain", "shift")
-            and view.truncation,
-        ),
         Limit("frozen molecules: GROMACS would compute forces between them", lambda view: view.frozen.any()),
         Limit("{}: GROMACS has no rigid bodies whose mass is neither on a line nor in a plane",
             lambda view: ", ".join(m.name for m in view.system.species if len(gromacs_points(m).mass) > 3)),

@@ -1,6 +1,7 @@
 """What LAMMPS can express, and how."""
 
 from rigidmd.engines.external import SPLIT, Key, Limit, Translations, is_langevin, moves
+from rigidmd.forces.potentials.truncation import TRUNCATIONS
 
 _INTEGRATOR, *_LIMITS = moves("LAMMPS", "rigid bodies")
 
@@ -11,8 +12,10 @@ TRANSLATIONS = Translations(
             "plain": "lj/cut", "shift": "lj/cut", "force_shift": "lj/smooth/linear", "force_switch": "lj/gromacs",
             "switch": "lj/mdf", "smooth_switch": "table",
         }, matters=lambda view: view.is_truncated),
+        Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "table")),
         Key("forces.electrostatics", {  # kspace style
-            "none": "", "reaction_field": "", "damped_shifted_force": "", "ewald": "ewald", "pme": "pppm",
+            **dict.fromkeys(("none", "coulomb", "reaction_field", "damped_shifted_force"), ""), "ewald": "ewald",
+            "pme": "pppm",
         }, matters=lambda view: view.coulomb),
         Key("forces.ewald_truncation", {None: "", "plain": ""},
             "LAMMPS has no shift of the real-space energy; take 'plain'", lambda view: view.has_ewald_sum),
@@ -29,6 +32,8 @@ TRANSLATIONS = Translations(
         _INTEGRATOR, Key("rotor", SPLIT, "LAMMPS' rotation is split"),
     ),
     limits=(
+        Limit("forces.tail_correction with a barostat: LAMMPS' barostat for rigid bodies does not know its pressure",
+            lambda view: view.has_barostat and view.system.tail is not None),
         Limit("a barostat for bodies and points together: LAMMPS' fix rigid/npt moves the box for one of them",
             lambda view: view.has_barostat and view.is_body.any() and (~view.is_body & ~view.frozen).any()),
     ),

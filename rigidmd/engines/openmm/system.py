@@ -18,7 +18,8 @@ from rigidmd.engines.openmm.translations import PME_ORDER, grid_for
 from rigidmd.engines.rigid_bodies import MassPoints, Points, RigidBodies, mass_points
 from rigidmd.errors import EngineError
 from rigidmd.forces.parts import gather_per_molecule
-from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
+from rigidmd.forces.potentials.coulomb import ReactionField
+from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.forces.potentials.truncation import Switched, Unmodified
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
@@ -176,7 +177,8 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
             found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     elif coulomb is not None and not isinstance(coulomb, ScreenedCoulomb):
         found.append((_custom_coulomb(particles, coulomb_formula(coulomb, 1.0)), Group.COULOMB_PAIRS))
-        if view.is_periodic and not isinstance(coulomb, DampedShiftedForce) and view.truncation == "plain":
+        is_plain = view.scene.forces.reaction_field_truncation == "plain"
+        if view.is_periodic and is_plain and isinstance(coulomb, ReactionField):
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
             found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:

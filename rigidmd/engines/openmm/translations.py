@@ -10,6 +10,7 @@ from rigidmd.forces.ewald.errors import charges_in, pme_grid_for, real_error
 from rigidmd.forces.ewald.pme import Pme
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
+from rigidmd.forces.potentials.truncation import TRUNCATIONS
 from rigidmd.units import COULOMB
 
 #: Order of OpenMM's splines.
@@ -39,11 +40,11 @@ _NO_GRID = f"no grid for OpenMM's splines, of order {PME_ORDER}, reaches the req
 TRANSLATIONS = Translations(
     "OpenMM",
     scene=(
-        Key("forces.truncation", dict.fromkeys(
-            ("plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"), "formula"
-        ), matters=lambda view: view.is_truncated),
+        Key("forces.truncation", dict.fromkeys(TRUNCATIONS, "formula"), matters=lambda view: view.is_truncated),
+        Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "formula")),
         Key("forces.electrostatics", {
-            "none": "", "reaction_field": "formula", "damped_shifted_force": "formula", "ewald": "PME", "pme": "PME",
+            "none": "", "coulomb": "", "reaction_field": "formula", "damped_shifted_force": "formula", "ewald": "PME",
+            "pme": "PME",
         }, matters=lambda view: view.coulomb),
         Key("forces.ewald_truncation", {None: "", "plain": "", "shift": "energy of a step"}),
         Key("run.remove_momentum_interval_ps", {None: "", False: ""},
@@ -60,6 +61,8 @@ TRANSLATIONS = Translations(
         _INTEGRATOR, Key("rotor", SPLIT, "OpenMM rotates molecules by constrained distances"),
     ),
     limits=(
+        Limit("forces.ewald_cutoff_A = {:g}: OpenMM has one cutoff for all forces; leave it out, or take cutoff_A",
+            lambda view: view.has_ewald_sum and view.coulomb.cutoff != view.system.cutoff and view.coulomb.cutoff),
         Limit(f"forces.electrostatics = {{!r}}: {_NO_GRID}",
             lambda view: view.has_ewald_sum and grid_for(view, PME_ORDER) is None and view.electrostatics),
         Limit("a barostat with frozen molecules: OpenMM would move them with the box",

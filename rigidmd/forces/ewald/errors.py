@@ -5,14 +5,19 @@ positions and orientations. Its unit is COULOMB, the force between two charges e
 accuracy of kspace_style in LAMMPS.
 """
 
-from math import exp, pi, sqrt
+from functools import cache
+from math import exp, inf, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
-MAX_PROXY_POINTS = 32  # along an edge in estimates: errors depend on the spacing, not on the number of points
+#: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16 they are good to 5 %.
+MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
+#: Shortest real-space cutoff that is tried; time of a pair within a cutoff and a margin, on the scale of the costs of
+#: grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å and accuracies of 1e-4 to 1e-5.
+SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.0
 ORDERS = (4, 5, 6, 7, 8)
 SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
 MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
@@ -96,7 +101,10 @@ def k_cutoff_of_count(count: int, volume: float) -> float:
     return (6 * pi**2 * count / volume) ** (1 / 3)
 
 
-def pme_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int) -> float:
+def pme_error(
+    charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int,
+    proxy_points: int = MAX_PROXY_POINTS,
+) -> float:  # fmt: skip
     """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows the edges.
 
     A Fourier component k of the charge causes components k' of the potential, at k and its aliases, with factors
@@ -106,7 +114,7 @@ def pme_error(charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int,
     """
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
-    points = np.minimum(grid, MAX_PROXY_POINTS)
+    points = np.minimum(grid, proxy_points)
     proxy = cell * (points / grid)[:, None]
     b = 2 * pi * np.linalg.inv(proxy).T
     metric = b @ b.T
@@ -158,24 +166,56 @@ def pme_grid_for(
     order: int | None = None, grid: tuple[int, int, int] | None = None,
 ) -> tuple[tuple[int, int, int], int] | None:  # fmt: skip
     """The fastest grid and spline order with at most this error; None if none has. order, grid : fixed, if given"""
+    return _fastest_grid(charges, alpha, cell, error, order, grid, MAX_PROXY_POINTS)[1]
+
+
+def _fastest_grid(
+    charges: Charges, alpha: float, cell: np.ndarray, error: float, order: int | None = None,
+    grid: tuple[int, int, int] | None = None, proxy_points: int = SEARCH_PROXY_POINTS,
+) -> tuple[float, tuple[tuple[int, int, int], int] | None]:  # fmt: skip
+    """Approximate time (ns) of the reciprocal part on one core with the fastest grid and order, and these; infinite and
+    None without any."""
     edges = np.linalg.norm(cell, axis=1)
     sensible = SPACINGS[edges.max() / SPACINGS <= MAX_GRID_POINTS]
     grids = [tuple(fft_size(edge / h) for edge in edges) for h in sensible] if grid is None else [grid]
-    best = None
+    best, cheapest = None, inf
     for p in ORDERS if order is None else (order,):
         low, high = 0, len(grids)
         while low < high:
             middle = (low + high) // 2
-            if pme_error(charges, alpha, cell, grids[middle], p) <= error:
+            if pme_error(charges, alpha, cell, grids[middle], p, proxy_points) <= error:
                 high = middle
             else:
                 low = middle + 1
         if low < len(grids):
-            # approximate time (ns) of the reciprocal part on one core; measured with 12288 sites, grids of 32³ to 48³
+            # measured with 12288 sites, orders 4 to 8, grids of 32³ to 54³
             cost = charges.count * (20 + 2.4 * p**2) + 8.0 * float(np.prod(grids[low]))
-            if best is None or cost < best[0]:
-                best = (cost, grids[low], p)
-    return best[1:] if best else None
+            if cost < cheapest:
+                best, cheapest = (grids[low], p), cost
+    return cheapest, best
+
+
+def fastest_cutoff(charges: Charges, cell: np.ndarray, longest: float, error: float) -> float | None:
+    """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and reciprocal space each have
+    this error; None if no cutoff reaches it. It follows from numbers of operations, not from a clock: the same scene
+    has the same cutoff everywhere."""
+    volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
+
+    @cache
+    def cost(k: int) -> float:
+        pairs = charges.count**2 / (2 * volume) * 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3
+        alpha = alpha_for(charges, cutoffs[k], volume, error)
+        return PAIR_NS * pairs + _fastest_grid(charges, alpha, cell, error)[0]
+
+    low, high = 0, len(cutoffs) - 1
+    while high - low > 2:  # the cost has one minimum, but for the steps between sizes of grids
+        third = max(1, (high - low) // 3)
+        if cost(low + third) <= cost(high - third):
+            high -= third
+        else:
+            low += third
+    best = min(range(low, high + 1), key=cost, default=None)
+    return None if best is None or cost(best) == inf else float(cutoffs[best])
 
 
 ALIASES = 30  # largest |m| in sums; its term is 1e-7 of the first for order 3, less for higher orders

@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, k_cutoff_for, k_cutoff_of_count, k_space_error,
-    pme_error, pme_grid_for, real_error,
+    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, fastest_cutoff, k_cutoff_for, k_cutoff_of_count,
+    k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
@@ -18,7 +18,10 @@ from rigidmd.forces.parts import Composition, Interactions, Settings, SystemPart
 from rigidmd.forces.potentials.screened_coulomb import screened_coulomb, screening_errors
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
-ACCURACY = 1e-5  # default of forces.ewald_accuracy
+#: Default of forces.ewald_accuracy: for SPC/E at 9 Å GROMACS' defaults have 9e-5 and OpenMM's 8e-5 by `errors`.
+ACCURACY = 5e-5
+#: Longest real-space cutoff that PME chooses, Å, and as a fraction of half an edge of the box, which may shrink.
+LONGEST_CUTOFF, SHRINKAGE = 14.0, 0.9
 #: Largest number of k-vectors along an edge, as for forces.ewald_k_max: more would take all memory.
 MOST_K_VECTORS = 1000
 MOST_K_VECTORS_IN_ALL = 2e7  # with which a step with 1000 sites takes half a minute
@@ -32,20 +35,28 @@ FIT_ERROR_FRACTION = 0.02
 def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
     """Messages on keys of [forces] that this box does not allow."""
     if space.volume == inf:
-        instead = "use reaction_field, which without a box is Coulomb's law"
+        instead = "use coulomb, the sum over all pairs"
         return [f"forces.electrostatics = {forces.electrostatics!r} needs a periodic box; {instead}"]
     return screening_errors("ewald_alpha_per_A", forces.ewald_alpha_per_A, cutoff)
 
 
-def settings(forces: Any, composition: Composition, cutoff: float) -> Settings:
-    """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of them are set."""
-    usual = "plain" if forces.truncation == "plain" else "shift"
+def settings(forces: Any, composition: Composition, cutoff: float, is_external: bool) -> Settings:
+    """The keys of [forces] that follow from the accuracy. ewald_accuracy becomes None when all of them are set.
+
+    cutoff : of Lennard-Jones, Å; is_external : whether another program computes the forces
+    """
+    usual = "plain" if forces.truncation == "plain" or is_external else "shift"
     numbers: dict[str, Any] = {"ewald_truncation": forces.ewald_truncation or usual}
     charges, cell = composition.charges, cell_of(composition.space)
     if charges.count == 0:
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
     part = accuracy / sqrt(2)  # of the real-space and of the reciprocal error
+    free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (None,) * 4
+    if forces.electrostatics == "pme" and free and not is_external:
+        longest = min(LONGEST_CUTOFF, SHRINKAGE * min(composition.space.edges) / 2)
+        cutoff = fastest_cutoff(charges, cell, longest, part) or cutoff
+    cutoff = numbers["ewald_cutoff_A"] = forces.ewald_cutoff_A or cutoff
     unreachable = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
     alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part))
     if alpha * cutoff > MAX_ALPHA_CUTOFF:
@@ -107,7 +118,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
     the interactions of frozen molecules, and None without any. Raises SceneError."""
     forces, volume, cell = parts.scene.forces, parts.space.volume, cell_of(parts.space)
     alpha, charges = forces.ewald_alpha_per_A, charges_in(parts.species, parts.counts)
-    real, reciprocal = real_error(charges, alpha, forces.cutoff_A, volume), 2 * pi * np.linalg.inv(cell).T
+    real, reciprocal = real_error(charges, alpha, forces.ewald_cutoff_A, volume), 2 * pi * np.linalg.inv(cell).T
     if parts.grid is not None:
         error, vectors = pme_error(charges, alpha, cell, parts.grid, forces.pme_order), None
         if not parts.moves[parts.model.species].all():
@@ -128,7 +139,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with an Ewald sum. Raises SceneError."""
     forces, (sites, charge_e), (real, k_space, vectors) = parts.scene.forces, parts.charged(), _errors(parts)
-    alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.cutoff_A, charge_e * COULOMB_CHARGE
+    alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
     if parts.grid is None:

@@ -2,13 +2,14 @@
 
 # isort: skip_file
 from math import inf, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, implements, kernel
 from rigidmd.compile.simd import inverse_root_and_cube, inverse_square_root, load, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.neighbors.space import Space
 from rigidmd.forces.parts import Interactions, SystemParts
 from rigidmd.forces.potentials.truncation import (
     NO_SWITCH, SWITCHES, SwitchCorrection, SwitchTerm, Truncation, TruncationName, TruncationTerms, correction,
@@ -58,16 +59,25 @@ def reaction_field(
 
 
 def interactions(parts: SystemParts) -> Interactions:
-    """The charges of a scene with electrostatics = "reaction_field"."""
+    """The charges of a scene with electrostatics = "reaction_field", and "coulomb", which has no cutoff."""
     forces, (sites, charge) = parts.scene.forces, parts.charged()
-    cutoff = forces.cutoff_A or inf
-    start = forces.switch_start_A or cutoff
-    potential = reaction_field(charge, cutoff, forces.reaction_field_permittivity, forces.truncation, start)
+    cutoff = (forces.cutoff_A if forces.electrostatics == "reaction_field" else None) or inf
+    start, name = forces.switch_start_A or cutoff, forces.reaction_field_truncation or "plain"
+    potential = reaction_field(charge, cutoff, forces.reaction_field_permittivity, name, start)
     constants = {}
     if cutoff < inf:
         energy = parts.sum_over_molecules(lambda q, x: self_energy(potential._replace(charge=q), x))
         constants["reaction_field_self"] = energy
     return Interactions({"coulomb": parts.pair_forces(potential, sites)}, constants)
+
+
+def setting_errors(forces: Any, space: Space, cutoff: float) -> list[str]:
+    """Messages on keys of [forces] that this box does not allow."""
+    if forces.electrostatics == "coulomb" and space.volume < inf:
+        return [
+            "forces.electrostatics = 'coulomb' is for open boxes; in a periodic one use pme, ewald or reaction_field"
+        ]
+    return []
 
 
 @chosen_by_type(inline=True)

@@ -25,12 +25,13 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from rigidmd.assemble.build import integrator_of_stage
+from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.state import State
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.run.pilot.choice import round_down
-from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
+from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene.stage import Stage
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND

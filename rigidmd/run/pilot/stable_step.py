@@ -1,14 +1,11 @@
 """The longest stable time step, estimated before the first step from the stiffest motion of a state."""
 
-from functools import cache
-from math import inf, sqrt
-from operator import itemgetter
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.species import species_of
-from rigidmd.core.integrators import DRIFT, KICK, RK4, Scheme, Solver
+from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.protocol import Engine
@@ -16,8 +13,6 @@ from rigidmd.engines.system import System
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.rotation import from_vector
-from rigidmd.scene import MolecularScene
-from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 #: Force evaluations for the stiffest motion; its frequency is then exact to a few percent.
 DIRECTIONS = 16
@@ -27,31 +22,6 @@ DISPLACEMENT = 1e-5
 MOST_DISPLACED = 50_000
 #: Molecules above which the estimate is made only if it costs less than 1 % of the stage.
 SMALL_SYSTEM = 1000
-#: Rms amplitudes of the stiffest motions of a liquid at its temperature, as angles and in diameters. Measured by
-#: `stiffest_mode` after 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in CO2
-#: and benzene; 0.019 diameters in argon, 0.020 in benzene, 0.017 in CO2, 0.006 in water.
-SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
-
-
-@cache
-def stable_angle(method: Scheme | Solver) -> float:
-    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps.
-
-    A step of a scheme multiplies (x, v/w) by a matrix of determinant 1, which is bounded while |trace| <= 2. Infinite
-    for solvers that choose their own steps.
-    """
-    if isinstance(method, Solver):
-        return 2 * sqrt(2) if method.name == RK4 else inf
-    angle = np.linspace(0, 30, 30_001)
-    z = angle**2
-    x, v = np.tile(np.eye(2)[:, :, None], len(z))  # rows of the matrix, of (x, v dt)
-    for flow in method.flows:
-        if flow.kind == KICK:
-            v = v - flow.fraction * z * (1 - flow.gradient * z) * x
-        elif flow.kind == DRIFT:
-            x = x + flow.fraction * v
-    beyond = np.abs(x[0] + v[1]) > 2 + 1e-9
-    return float(angle[beyond.argmax()]) if beyond.any() else inf
 
 
 class StiffestMode(NamedTuple):
@@ -118,40 +88,6 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
 def _product(a: np.ndarray, b: np.ndarray) -> float:
     """Scalar product of long vectors. `a @ b` would start threads that then spin on cores that a run needs."""
     return float(np.einsum("i,i", a, b))
-
-
-def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of time steps that are too long for these molecules in a liquid, without compiled code.
-
-    At a temperature T a motion of angular frequency w has the rms amplitude sqrt(kT/m)/w. So a step is unstable if a
-    molecule at its thermal speed sqrt(kT/m) moves or rotates in it by more than `stable_angle` such amplitudes.
-    """
-    warnings = []
-    species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
-    temperature = scene.start.temperature_K
-    for k, stage in enumerate(scene.stages):
-        temperature = max(stage.temperatures) or temperature
-        if stage.is_auto or stage.is_minimisation or not (species and temperature and scene.watch.stable_step):
-            continue
-        thermal, swings = BOLTZMANN * temperature, []
-        for m in species:
-            diameter = max((sigma for sigma, depth in zip(m.sigma, m.epsilon, strict=True) if depth > 0), default=inf)
-            lightest = min((moment for moment in m.inertia if moment > 0), default=inf)
-            size, rotation = SWING_DIAMETERS, "rotates about its lightest axis"
-            swings += [
-                (size * diameter * sqrt(m.mass / thermal), size, "diameters", m.name, "moves"),
-                (SWING_RAD * sqrt(lightest / thermal), SWING_RAD, "rad", m.name, rotation),
-            ]
-        # time (ps) for the amplitude at the thermal speed, the amplitude
-        time, size, unit, name, does = min(swings, key=itemgetter(0))
-        longest, dt = stable_angle(stage.scheme) * time, stage.timestep_fs * FEMTOSECOND
-        if dt > longest:
-            warnings.append(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is too long for {name} at {temperature:g} K: in a "
-                f"step it {does} by {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to "
-                f"{longest / FEMTOSECOND:.3g} fs where, as in liquids, the stiffest motions swing by {size:g} {unit}"
-            )
-    return warnings
 
 
 def fastest_body_rate(system: BodySystem) -> float:

@@ -6,17 +6,20 @@ The functions `choose_for_...` apply `choice` to them for `integrator = "auto"`.
 import re
 from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from math import ceil, gcd, inf, sqrt
 
 import numpy as np
 
 from rigidmd.assemble.body import build_body
-from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Solver
+from rigidmd.assemble.time_step import error_of_step, precision_for
+from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
 from rigidmd.engines.body_motion import Motion, Snapshot, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.observables import observe
 from rigidmd.engines.ode.rates import SMALLEST_SINE
+from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.run.pilot.choice import choose
@@ -67,6 +70,13 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
     boxed = system.space.volume < inf
     conserved = system.model.keeps_momentum
 
+    def engine(scheme: Scheme, timestep_fs: float) -> Engine:
+        """With precision = "auto" each trial has the precision of a run with its step."""
+        if not system.precision_reason:
+            return system.engine()
+        error = error_of_step(system.species, thermal / BOLTZMANN, scheme, timestep_fs)
+        return system.engine_of(system.terms, precision_for(error))
+
     def conserved_errors(now: State) -> dict[str, float]:
         """Errors of the conserved components of the total momentum and, with neither box nor fields, of the angular
         momentum, relative to the sums of their sizes."""
@@ -81,7 +91,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
     return TrialSystem(
         name=system.scene.name, state=state,
         methods={
-            name: Method(lambda: system.engine(), scheme if scheme.exact_rotor else scheme.with_rotor(rotor))
+            name: Method(partial(engine, scheme), scheme if scheme.exact_rotor else scheme.with_rotor(rotor))
             for name, scheme in system.scene.schemes.items()
         },
         energy=lambda engine, now: observe(system, engine, now, energy_unit=1.0).conserved,
@@ -90,7 +100,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
         length_unit="Å", reference="srkn_6", conserved_errors=conserved_errors, can_continue=True,
         refused={name: "it is for single bodies" for name in COMPARATORS},
         observe=(lambda engine, now, step: observe(system, engine, now, verlet_step=step)) if boxed else None,
-        molecules=len(system.model.species), freedom=freedom,
+        molecules=len(system.model.species), freedom=freedom, chooses_precision=bool(system.precision_reason),
     )  # fmt: skip
 
 
@@ -145,7 +155,7 @@ def body_trial_system(
     for name, fit in fits.items():
         scheme = scene.schemes[name] if name in scene.schemes else fit.method._replace(duration=whole)
         scheme = scheme if isinstance(scheme, Solver) or scheme.exact_rotor else scheme.with_rotor(run.rotor)
-        methods[name] = Method(fit.engine, scheme)
+        methods[name] = Method(lambda _, fit=fit: fit.engine(), scheme)
     at_a_pole = system.rotates and np.hypot(*system.state.rotation[0, :2, 2]) <= SMALLEST_SINE
     reference = max(
         (name for name in fits if name in SCHEMES),

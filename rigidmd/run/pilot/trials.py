@@ -42,7 +42,7 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 class Method(NamedTuple):
     """A way to move a system: an engine and an integrator."""
 
-    engine: Callable[[], Engine]
+    engine: Callable[[float], Engine]  # for steps of this length, in the unit of the system
     scheme: Scheme | Solver
 
     @property
@@ -72,6 +72,7 @@ class TrialSystem:
     refused : name -> reason, of methods that cannot move this system; singular : names of those singular at the start
     observe : the averaged observables of molecules in a box; None for others
     rounding : relative rms errors of forces and torques in mixed precision; None in double
+    chooses_precision : whether each trial has the precision that suits the error of its step
     """
 
     name: str
@@ -95,6 +96,7 @@ class TrialSystem:
     molecules: int = 1
     freedom: int = 1
     rounding: tuple[float, float] | None = None
+    chooses_precision: bool = False
 
 
 @dataclass
@@ -318,7 +320,7 @@ def trial_of(system: TrialSystem, integrator: str, steps: int) -> Trial:
 def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Callable[[int], None]]:
     """A new engine, a state at the start, and a function that advances it to a number of steps since the start."""
     method = system.methods[trial.integrator]
-    engine, scheme, dt = method.engine(), method.scheme, trial.timestep * system.time_size
+    engine, scheme, dt = method.engine(trial.timestep), method.scheme, trial.timestep * system.time_size
     if trial.tolerance is not None:
         scheme = scheme._replace(relative_tolerance=trial.tolerance, absolute_tolerance=trial.tolerance)
         dt = system.span / trial.steps
@@ -329,7 +331,7 @@ def _begin_trial(system: TrialSystem, trial: Trial) -> tuple[Engine, State, Call
 def final_state(system: TrialSystem, steps: int) -> State:
     """The state at the end of the span after this many steps of the reference."""
     method = system.methods[system.reference]
-    engine = method.engine()
+    engine = method.engine(0.0)
     state = engine.begin(system.state, method.scheme)
     engine.advance(state, method.scheme, system.span / steps, steps)
     return state

@@ -166,7 +166,11 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
         lines.append(
             f"mixed precision: forces differ from double ones by {force:.1e} of their rms"
             + (f", torques by {torque:.1e}" if torque else "")
-            + "; the reference is in mixed precision too"
+            + (
+                "; trials with long steps have it, others and the reference are in double precision"
+                if s.chooses_precision
+                else "; the reference is in mixed precision too"
+            )
         )
     for name in dict.fromkeys(t.integrator for t in found.trials):
         failures = [t.failure for t in found.trials if t.integrator == name and t.failure]

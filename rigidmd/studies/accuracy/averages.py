@@ -11,6 +11,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
@@ -20,7 +21,7 @@ from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
-from rigidmd.run.pilot.stable_step import stable_angle, stiffest_mode
+from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, Stage
