@@ -45,6 +45,16 @@ SPRING = 30_000.0
 # a system, its engine, its state
 
 
+def pinned(tables: dict) -> dict:
+    """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail correction and double
+    precision, unless they say otherwise: one set of kernels for most tests. The defaults of users have tests of their
+    own."""
+    forces = {"electrostatics": "reaction_field", "tail_correction": False} | tables.get("forces", {})
+    if forces["electrostatics"] == "reaction_field":
+        forces = {"reaction_field_truncation": forces.get("truncation", "switch")} | forces
+    return {"precision": "double"} | tables | {"forces": forces}
+
+
 def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sections) -> Scene:
     """A scene of shipped models in a cube (no periodic box if edge is None), two NVE steps."""
     data = {
@@ -53,7 +63,7 @@ def small_scene(counts: dict[str, int], edge: float | None, folder=".", **sectio
         "start": {"temperature_K": 300.0},
         "stages": [{"duration_ps": 0.004}],
     }
-    return Scene.from_dict(data | sections, folder)
+    return Scene.from_dict(pinned(data | sections), folder)
 
 
 def system_of(counts, edge=40.0, cutoff=5.0, **sections) -> System:
