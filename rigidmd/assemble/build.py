@@ -63,14 +63,14 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         rotation=start.rotation if any(m.inertia.any() for m in species) else None,
         cell=start.cell,
     )
-    kinetic = 0.0 if velocity is None else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
-    free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
-    scene, precision_reason = with_precision(scene, free, kinetic / BOLTZMANN)
     parts = SystemParts(scene, species, model, space, state, number, start.basis, resolved.pme_grid)
     acting = interactions(parts)
     acting.terms.update(field_terms(parts))
     model = model._replace(keeps_momentum=conserved_momentum(model, acting.terms))
     scene = with_momentum_removal(scene, model.keeps_momentum)
+    thermal = 0.0 if velocity is None else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
+    free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
+    scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
     system = System(
         scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
         freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,

@@ -18,7 +18,7 @@ from rigidmd.core.integrators import DRIFT, KICK, RK4, Scheme, Solver
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BOLTZMANN, FEMTOSECOND
+from rigidmd.units import BOLTZMANN, COULOMB, FEMTOSECOND
 
 #: Rms amplitudes of the fastest motions of a liquid at its temperature, as angles and in diameters. Measured by
 #: `stiffest_mode` after 3 ps: 0.11 rad in SPC/E, 0.10 in TIP4P/2005, 0.12 in methanol, 0.09 in nitrogen, 0.05 in CO2
@@ -27,6 +27,8 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 #: Rms error of forces in mixed precision, relative to the rms force. Measured for a liquid with a cutoff of 9 Å: 3.2e-6
 #: for 512 SPC/E with PME, 3.3e-6 for 216 TIP4P/2005 with a reaction field, 1.4e-6 for 500 argon; the largest 1e-5.
 MIXED_ERROR = 3e-6
+#: Least error of Ewald sums that grids in single precision allow, e²/Å².
+MIXED_EWALD_ERROR = 3e-6
 #: precision = "auto" is mixed where the error of the time step is at least this many times that of mixed precision.
 MARGIN = 30
 
@@ -128,11 +130,14 @@ def precision_for(error: float) -> Literal["double", "mixed"]:
     return "mixed" if error >= MARGIN * MIXED_ERROR else "double"
 
 
-def with_precision(scene: MolecularScene, species: list[Molecule], temperature: float) -> tuple[MolecularScene, str]:
+def with_precision(
+    scene: MolecularScene, species: list[Molecule], temperature: float, force_error: float | None
+) -> tuple[MolecularScene, str]:
     """A scene with its precision and, for "auto", the reason: mixed if the error of the time step hides that of single
     precision in every stage, else double.
 
-    species : those that are not frozen; temperature : of velocities from a file, K
+    species : those that are not frozen; temperature : of velocities from a file, K; force_error : of an Ewald sum, of
+    the force on a site, u Å/ps²
     """
     if scene.precision != "auto":
         return scene, ""
@@ -144,6 +149,8 @@ def with_precision(scene: MolecularScene, species: list[Molecule], temperature: 
     precision, why = "double", "no stage has a given time step"
     if scene.engine.is_external:
         why = f"{scene.engine.title} computes the forces of the run"
+    elif force_error is not None and force_error < MIXED_EWALD_ERROR * COULOMB:
+        why = f"the Ewald sum is good to {force_error / COULOMB:.1e} e²/Å², finer than single precision"
     elif seeks:
         why = f"stages.{seeks[0]} chooses its step for a small error"
     elif errors:

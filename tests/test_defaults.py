@@ -1,0 +1,282 @@
+"""The defaults of users: electrostatics, truncation of charges, tail correction, real-space cutoff of PME, precision."""
+
+from math import erfc, inf, sqrt
+
+import numpy as np
+import pytest
+from scipy.special import erfcinv
+from support import (
+    MARGIN,
+    MIXED_ERROR,
+    SCHEMES,
+    WITH_THERMOSTAT,
+    build,
+    charges_in,
+    coulomb_errors,
+    describe,
+    error_of_step,
+    pinned,
+    pme_error,
+    real_error,
+    small_scene,
+    stable_angle,
+    step_error,
+)  # fmt: skip
+
+from rigidmd import Scene, Simulation
+from rigidmd.errors import SceneError
+from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
+
+WATER = {"model": "spce", "count": 64}
+NVT = {"ensemble": "nvt", "temperature_K": 298.15, "duration_ps": 0.02}
+
+
+def scene(edge: float | None = 13.0, **tables) -> Scene:
+    """64 waters with nothing but what a user has to say."""
+    box = {"lengths_A": edge} if edge else {"lengths_A": 13.0, "periodic": False}
+    forces = {"cutoff_A": 6.0} if edge else {}
+    return Scene.from_dict({"box": box, "molecules": [WATER], "forces": forces, "stages": [NVT]} | tables)
+
+
+def forces_of(**tables):
+    return build(scene(**tables)).scene.forces
+
+
+def test_charges_act_on_all_images_in_a_box_and_by_coulomb_without_one():
+    assert forces_of().electrostatics == "pme"
+    assert forces_of(edge=None).electrostatics == "coulomb"
+    assert forces_of(molecules=[{"model": "argon", "count": 64}]).electrostatics == "none"
+    assert forces_of(forces={"electrostatics": "reaction_field", "cutoff_A": 6.0}).electrostatics == "reaction_field"
+
+
+@pytest.mark.parametrize(
+    ("edge", "forces", "message"),
+    [
+        (13.0, {"reaction_field_permittivity": 78.0}, "would do nothing with electrostatics = 'pme' .the default."),
+        (
+            None,
+            {"ewald_accuracy": 1e-4},
+            "ewald_accuracy would do nothing with electrostatics = 'coulomb' .the default",
+        ),
+        (13.0, {"electrostatics": "coulomb"}, "'coulomb' is for open boxes; in a periodic one use pme"),
+        (None, {"electrostatics": "pme"}, "'pme' needs a periodic box; use coulomb, the sum over all pairs"),
+        (13.0, {"ewald_cutoff_A": 7.0}, "ewald_cutoff_A = 7 is longer than half the shortest edge"),
+        (13.0, {"electrostatics": "pme", "reaction_field_truncation": "switch"}, "reaction_field_truncation would do"),
+    ],
+)
+def test_keys_that_do_nothing_are_refused(edge, forces, message):
+    with pytest.raises(SceneError, match=message):
+        build(scene(edge, forces={"cutoff_A": 6.0} | forces))
+
+
+def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
+    simulation = Simulation(scene(None, forces={"cutoff_A": 4.0}))
+    found = simulation.start_energy(KJ_PER_MOL, "kJ/mol")["components"]
+    system = simulation.system
+    position, charge = system.site_positions(simulation.state), system.of_sites(lambda m: m.charges) * COULOMB_CHARGE
+    distance = np.linalg.norm(position[:, None] - position, axis=2)
+    other = np.not_equal.outer(system.sites.molecule, system.sites.molecule)
+    pairs = np.divide(np.outer(charge, charge), distance, out=np.zeros_like(distance), where=other)
+    assert found["coulomb"] == pytest.approx(pairs.sum() / 2 / KJ_PER_MOL, rel=1e-10)
+    assert system.terms["lennard_jones"].potential.cutoff == 4.0
+
+
+# --- truncation of charges -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("forces", "expected"),
+    [
+        ({}, "shift"), ({"truncation": "force_switch"}, "shift"), ({"truncation": "plain"}, "plain"),
+        ({"truncation": "smooth_switch"}, "smooth_switch"), ({"reaction_field_truncation": "switch"}, "switch"),
+    ],
+)  # fmt: skip
+def test_a_reaction_field_is_truncated_apart_from_lennard_jones(forces, expected):
+    found = forces_of(forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"} | forces)
+    assert (found.reaction_field_truncation, found.truncation) == (expected, forces.get("truncation", "switch"))
+
+
+def test_the_force_of_a_conducting_reaction_field_vanishes_at_the_cutoff():
+    system = build(scene(forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"}))
+    term = system.terms["coulomb"]
+    energy = [1 / r + term.potential.field * r**2 + term.potential.terms[0] for r in (6.0, 6.0 - 1e-4)]
+    assert energy[0] == pytest.approx(0, abs=1e-15)
+    assert energy[1] == pytest.approx(0, abs=1e-8)
+
+
+# --- tail correction -------------------------------------------------------------------------------------------------
+
+
+def positions_file(path, position, edges) -> str:
+    rows = [f"Ar {x} {y} {z}" for x, y, z in position]
+    lattice = " ".join(f"{x:g}" for x in np.diag(edges).ravel())
+    path.write_text("\n".join([str(len(rows)), f'Lattice="{lattice}" Properties=species:S:1:pos:R:3', *rows]) + "\n")
+    return path.name
+
+
+@pytest.mark.parametrize(
+    ("lattice", "edges", "expected"),
+    [
+        ((5, 5, 5), (20.0, 20.0, 20.0), True),
+        ((5, 5, 5), (20.0, 20.0, 60.0), False),  # a slab
+        ((5, 5, 5), (60.0, 60.0, 60.0), False),  # a droplet
+        ((5, 5, 15), (20.0, 20.0, 60.0), True),
+        ((2, 2, 2), (20.0, 20.0, 20.0), True),  # few molecules are far apart, and even
+    ],
+)
+def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expected, tmp_path):
+    spacing = np.array(edges) / lattice if expected else np.full(3, 4.0)
+    position = spacing * (np.array(list(np.ndindex(*lattice))) + 0.5)
+    tables = {
+        "structure": {"file": positions_file(tmp_path / "argon.xyz", position, edges)},
+        "molecules": [{"model": "argon"}], "forces": {"cutoff_A": 6.0}, "stages": [NVT | {"temperature_K": 90.0}],
+    }  # fmt: skip
+    system = build(Scene.from_dict(tables, tmp_path))
+    assert system.scene.forces.tail_correction is expected
+    assert (system.tail is not None) == expected
+    assert ("tail correction: -" in describe(system.scene)) == expected
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"molecules": [WATER, {"model": "argon", "count": 2, "frozen": True}]},
+        {"fields": {"walls": [{"axis": "z", "positions_A": [0.0, 13.0], "kind": "harmonic",
+                               "stiffness_kJ_mol_A2": 100.0}]}},
+        {"forces": {"cutoff_A": 6.0, "lennard_jones": False}},
+    ],
+)  # fmt: skip
+def test_no_tail_correction_beside_walls_and_frozen_molecules(tables):
+    system = build(scene(**tables))
+    assert system.tail is None
+    assert any("tail correction" in reason for reason in system.left_out)
+
+
+# --- PME -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cutoff", [6.0, 9.0])
+def test_the_real_space_cutoff_of_pme_is_that_of_speed_and_keeps_the_accuracy(cutoff):
+    tables = {"molecules": [WATER | {"count": 216}], "box": {"density_g_cm3": 0.997}, "precision": "double"}
+    system = build(scene(**tables, forces={"cutoff_A": cutoff}))
+    forces = system.scene.forces
+    assert 5.0 <= forces.ewald_cutoff_A <= 7.0  # by the density of charges, not by Lennard-Jones
+    assert (forces.cutoff_A, system.terms["lennard_jones"].potential.cutoff) == (cutoff, cutoff)
+    assert system.terms["coulomb_real"].potential.cutoff == forces.ewald_cutoff_A
+    found = coulomb_errors(system, system.state)
+    assert found["in_e2_per_A2"] < 5e-5
+    again = build(system.scene)
+    assert again.scene.forces == forces  # a resolved scene stays as it is
+
+
+def test_dilute_charges_have_a_longer_cutoff_and_given_ones_stay():
+    ions = [{"model": "na_spce", "count": 5}, {"model": "cl_spce", "count": 5}]
+    assert forces_of(edge=50.0, molecules=ions).ewald_cutoff_A > 8.0
+    assert forces_of(forces={"cutoff_A": 6.0, "ewald_cutoff_A": 6.2}).ewald_cutoff_A == 6.2
+    assert forces_of(forces={"cutoff_A": 6.0, "ewald_alpha_per_A": 0.5}).ewald_cutoff_A == 6.0
+    assert forces_of(forces={"cutoff_A": 6.0, "electrostatics": "ewald"}).ewald_cutoff_A == 6.0
+
+
+def test_the_accuracy_is_better_than_the_defaults_of_gromacs_and_openmm():
+    """GROMACS: ewald-rtol 1e-5, order 4, a grid of at most 1.2 Å; OpenMM: a tolerance of 5e-4, order 5."""
+    edge, cutoff = 49.72, 9.0
+    charges = charges_in(build(scene()).species, np.array([4096]))
+    cell, volume, tolerance = edge * np.eye(3), edge**3, 5e-4
+    alphas = float(erfcinv(1e-5)) / cutoff, sqrt(-np.log(2 * tolerance)) / cutoff
+    assert erfc(alphas[0] * cutoff) == pytest.approx(1e-5)
+    grids = (42, 42, 42), (45, 45, 45)  # ceil(2 alpha L/(3 tolerance^(1/5))) of OpenMM
+    errors = [
+        np.hypot(real_error(charges, alpha, cutoff, volume), pme_error(charges, alpha, cell, grid, order))
+        for alpha, grid, order in zip(alphas, grids, (4, 5), strict=True)
+    ]
+    assert np.round(np.array(errors) * 1e5) == pytest.approx([9, 8])  # as in the manual
+    assert build(scene()).force_error / COULOMB < 5e-5 < min(errors)
+
+
+# --- precision -------------------------------------------------------------------------------------------------------
+
+
+def precision_of(**stage) -> tuple[str, str]:
+    system = build(scene(stages=[{key: value for key, value in (NVT | stage).items() if value is not None}]))
+    return system.scene.precision, system.precision_reason
+
+
+@pytest.mark.parametrize(
+    ("stage", "precision", "reason"),
+    [
+        ({}, "mixed", "velocity_verlet at 2 fs has an error of about 9.8e-03"),
+        ({"timestep_fs": 0.1}, "double", "less than 30 times that of single precision"),
+        ({"integrator": "srkn_4", "timestep_fs": 2.0}, "double", "srkn_4 at 2 fs"),
+        ({"integrator": "two_stage", "timestep_fs": 4.0}, "mixed", "two_stage at 4 fs"),
+        ({"ensemble": "minimise", "temperature_K": None, "duration_ps": None}, "double", "no stage has a given time step"),
+        ({"integrator": "auto", "energy_error_kT": 1e-4, "timestep_fs": None}, "double", "chooses its step for a small"),
+    ],
+)  # fmt: skip
+def test_precision_is_single_between_sites_where_the_step_hides_it(stage, precision, reason):
+    tables = {} if stage.get("ensemble") != "minimise" else {"start": {"temperature_K": 300.0}}
+    stages = [{key: value for key, value in (NVT | stage).items() if value is not None}]
+    if stage.get("integrator") == "auto":
+        stages[0]["ensemble"] = "nve"
+        del stages[0]["temperature_K"]
+        tables = {"start": {"temperature_K": 300.0}}
+    system = build(scene(stages=stages, **tables))
+    assert system.scene.precision == precision
+    assert reason in system.precision_reason
+    assert f"{precision} precision, chosen because" in describe(system.scene.model_copy(update={"precision": "auto"}))
+
+
+def test_the_strictest_stage_decides_and_a_given_precision_stays():
+    fine = NVT | {"timestep_fs": 0.1}
+    assert build(scene(stages=[NVT, fine])).scene.precision == "double"
+    assert build(scene(stages=[{"ensemble": "minimise"}, NVT])).scene.precision == "mixed"
+    for given in ("double", "mixed"):
+        system = build(scene(precision=given))
+        assert (system.scene.precision, system.precision_reason) == (given, "")
+
+
+def test_fine_ewald_sums_are_in_double_precision():
+    system = build(scene(forces={"cutoff_A": 6.0, "ewald_accuracy": 1e-7}))
+    assert system.scene.precision == "double"
+    assert "finer than single precision" in system.precision_reason
+
+
+def test_a_run_says_its_precision_and_energy_is_in_double(tmp_path):
+    simulation = Simulation(scene())
+    summary = simulation.run().summary
+    assert summary["precision"] == "mixed"
+    assert summary["precision_reason"].startswith("mixed: velocity_verlet at 2 fs")
+    energy = Simulation(scene()).start_energy(KJ_PER_MOL, "kJ/mol")
+    exact = Simulation(scene(precision="double")).start_energy(KJ_PER_MOL, "kJ/mol")
+    assert energy["components"] == exact["components"]
+
+
+@pytest.mark.parametrize("name", ["velocity_verlet", "two_stage", "pefrl", "srkn_6", "takahashi_imada"])
+def test_the_error_of_a_step_is_that_of_the_frequency(name):
+    """The phase of an oscillator after many steps, against w t."""
+    scheme, angle = SCHEMES[name], 0.3
+    matrix = np.eye(2)
+    for flow in scheme.flows:
+        if flow.kind == 0:  # a kick
+            matrix = np.array([[1, 0], [-flow.fraction * angle**2 * (1 - flow.gradient * angle**2), 1]]) @ matrix
+        else:
+            matrix = np.array([[1, flow.fraction], [0, 1]]) @ matrix
+    followed = abs(np.angle(np.linalg.eigvals(matrix)[0]))
+    assert step_error(scheme, angle) == pytest.approx(abs((followed / angle) ** 2 - 1), rel=1e-6, abs=1e-12)
+    assert step_error(scheme, 1.01 * stable_angle(scheme)) == inf
+
+
+def test_the_error_of_velocity_verlet_is_known():
+    for angle in (0.01, 0.1, 0.3):
+        assert step_error(SCHEMES["velocity_verlet"], angle) == pytest.approx(angle**2 / 12, rel=0.02)
+        assert step_error(WITH_THERMOSTAT["baoab"], angle) == pytest.approx(angle**2 / 12, rel=0.02)
+    species = build(scene()).species
+    assert error_of_step(species, 0.0, SCHEMES["velocity_verlet"], 2.0) == 0.0
+    assert error_of_step(species, 298.15, SCHEMES["velocity_verlet"], 2.0) > 100 * MARGIN * MIXED_ERROR
+
+
+def test_pinned_scenes_are_not_the_defaults():
+    found = build(small_scene({"spce": 64}, 13.0, forces={"cutoff_A": 6.0})).scene
+    assert (found.forces.electrostatics, found.precision, found.forces.tail_correction) == (
+        "reaction_field", "double", False,
+    )  # fmt: skip
+    assert pinned({})["forces"]["reaction_field_truncation"] == "switch"
