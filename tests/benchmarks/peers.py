@@ -107,13 +107,17 @@ class Workload:
     def scene(self, truncation: str = "shift", accuracy: float | None = None, **changes) -> dict:
         """Its scene, NVE from the start unless changed, for Scene.from_dict. accuracy : of PME, PME_ACCURACY unless given"""
         start = {"switch_start_A": self.cutoff - SWITCH} if truncation == "switch" else {}
-        field = {"reaction_field_permittivity": self.permittivity} if self.charged else {"electrostatics": "none"}
+        field = {"electrostatics": "none"}
         if self.pme:
-            field = {"electrostatics": "pme", "ewald_accuracy": accuracy or PME_ACCURACY}
+            field = {"electrostatics": "pme", "ewald_accuracy": accuracy or PME_ACCURACY, "ewald_cutoff_A": self.cutoff}
+        elif self.charged:
+            field = {"electrostatics": "reaction_field", "reaction_field_permittivity": self.permittivity,
+                     "reaction_field_truncation": truncation}  # fmt: skip
         whole = {
             "box": {"lengths_A": self.edge},
             "molecules": [{**self.molecules, "count": self.count}],
-            "forces": {"cutoff_A": self.cutoff, "truncation": truncation, **start, **field},
+            "forces": {"cutoff_A": self.cutoff, "truncation": truncation, "tail_correction": False, **start, **field},
+            "precision": "double",
             "structure": {"file": "start.npz", "velocities": True},
             "stages": [{"duration_ps": 1.0}],
             "output": {"trajectory": False, "figures": False, "log_interval_ps": 1e3},
