@@ -59,7 +59,7 @@ def run_rigidmd(case: dict, folder: Path, steps: int) -> float:
     (folder / "scene.toml").write_text("".join(f"{key} = {toml(value)}\n" for key, value in scene.items()))
     call([program("rigidmd"), "run", "scene.toml", "-o", "out", "--force"], folder)
     summary = json.loads((folder / "out/summary.json").read_text())
-    case["settings"] = summary["notes"][:2] + [summary["precision_reason"]]
+    case["settings"] = [*summary["notes"][:2], summary["precision_reason"]]
     return summary["stages"][0]["steps_per_s"]
 
 
@@ -91,8 +91,8 @@ def main() -> None:
     parser.add_argument("--cases", default="", help="words that a case has to contain")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    os.environ.clear()
-    os.environ.update(environment())
+    for name in os.environ.keys() - environment().keys():
+        del os.environ[name]
     print(Gromacs.version())
     found = {}
     for name, case in CASES.items():
