@@ -3,9 +3,9 @@
 Kernels are compiled for the types of the force terms, which takes 95 % of the time of all tests. What makes a type: how
 a potential ends (truncation), the electrostatics with the number of coefficients that its accuracy needs, the precision,
 whether the cell is slanted, open or neither, and whether all molecules are single sites. Which models are in the scene,
-how many, the cutoff and the time steps make none. A test that needs nothing special takes the defaults of a scene
-(truncation "switch", reaction field), {"truncation": "smooth_switch"}, or PME with its default accuracy, in double
-precision: these are compiled in any case. In mixed precision the defaults are.
+how many, the cutoff and the time steps make none. A test that needs nothing special takes `support.small_scene` with its
+settings (truncation "switch" of all forces, reaction field), {"truncation": "smooth_switch"}, or PME with its default
+accuracy, in double precision, or the defaults of a scene (PME in mixed precision): these are compiled in any case.
 """
 
 import numpy as np
@@ -33,7 +33,13 @@ SCENES = {
 FORTY_WATERS = {
     "box": {"density_g_cm3": 0.9},
     "molecules": [{"model": "spce", "count": 40}],
-    "forces": {"cutoff_A": 5.0, "truncation": "smooth_switch"},
+    "forces": {
+        "cutoff_A": 5.0,
+        "truncation": "smooth_switch",
+        "electrostatics": "reaction_field",
+        "tail_correction": False,
+    },
+    "precision": "double",
     "start": {"temperature_K": 298.0},
     "output": {"log_interval_ps": 0.013, "trajectory_interval_ps": 0.02, "figures": False},
 }

@@ -417,7 +417,7 @@ def turned(atoms: Atoms) -> Atoms:
 
 
 def test_stress_and_any_cell(waters):
-    settings = {"cutoff_A": 5.0, "truncation": "smooth_switch"}
+    settings = FORCES
     waters = waters.copy()
     waters.calc = RigidMD(["spce"], **settings)
     exact = waters.get_stress(voigt=False)

@@ -344,7 +344,13 @@ def test_ions_in_a_triclinic_cell(reference, method, tmp_path):
     data = {
         "structure": {"file": "ions.gro"},
         "molecules": ions,
-        "forces": {"cutoff_A": 10.0, "truncation": "plain", "electrostatics": method, "ewald_accuracy": 1e-8},
+        "forces": {
+            "cutoff_A": 10.0,
+            "truncation": "plain",
+            "electrostatics": method,
+            "ewald_accuracy": 1e-8,
+            "tail_correction": False,
+        },
         "start": {"temperature_K": 100.0},
         "stages": [{"duration_ps": 1.0}],
     }
@@ -859,7 +865,9 @@ model = "spce"
 count = 8
 [forces]
 cutoff_A = 6
-truncation = "{truncation}"
+electrostatics = "reaction_field"
+truncation = "shift"
+reaction_field_truncation = "{truncation}"
 [start]
 temperature_K = 300
 [[stages]]
@@ -1017,8 +1025,8 @@ def test_settings_that_make_no_sense(forces, words):
 
 
 @pytest.mark.parametrize(("method", "words"), [
-    ("ewald", "needs a periodic box; use reaction_field"),
-    ("pme", "needs a periodic box; use reaction_field"),
+    ("ewald", "needs a periodic box; use coulomb"),
+    ("pme", "needs a periodic box; use coulomb"),
     ("damped_shifted_force", "needs a cutoff; give forces.cutoff_A"),
 ])  # fmt: skip
 def test_what_needs_a_box_or_a_cut_off_says_so(method, words):
@@ -1050,7 +1058,7 @@ sys.path.insert(0, "tests")
 from support import build
 from rigidmd.commands.cli import main
 from rigidmd.scene import Scene
-for forces in ({}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
+for forces in ({"electrostatics": "reaction_field"}, {"electrostatics": "ewald", "cutoff_A": 6.0}):
     data = {"box": {"lengths_A": 18.1}, "molecules": [{"model": "spce", "count": 9}], "forces": forces,
             "start": {"temperature_K": 300.0}, "stages": [{"duration_ps": 0.1}]}
     build(Scene.from_dict(data))

@@ -747,6 +747,7 @@ class Forces(Section):
     \"\"\"A soft repulsion\"\"\"
 """
 SOFT_SCENE = """
+precision = "double"
 [box]
 lengths_A = 26.0
 [[molecules]]
