@@ -42,10 +42,9 @@ def _view(options: Options) -> int:
     scene="this run", writes=True,
 )  # fmt: skip
 def _film(options: Options) -> int:
-    from rigidmd.view.animation import EXTENSIONS, check_writer, default_name, write_film
+    from rigidmd.view.animation import EXTENSIONS, default_name, write_film
 
     path = file_about_run(options, default_name(), EXTENSIONS)
-    check_writer(path)
     with progress_bar() as progress:
         path, notes = write_film(
             Path(options.folder), path, options.seconds, options.plots, options.height, progress

@@ -118,13 +118,12 @@ def read_geometry(path: Path) -> tuple[list[str], list[str], np.ndarray, np.ndar
 
 
 def _choose(path: Path, frames: list[Callable[[], Atoms]], frame: int | None) -> Callable[[], Atoms]:
-    if frame is None and (form := format_of(path)) is not None and form.read is None:
-        frame = -1
     if frame is None:
-        if len(frames) > 1:
+        form = format_of(path)
+        frame = -1 if form is not None and form.read is None else 1
+        if frame == 1 and len(frames) > 1:
             hint = f"keep one, or for a start select one by structure.frame (1 to {len(frames)}, -1 for the last)"
             raise structure_error(path, f"holds {len(frames)} structures: {hint}")
-        frame = 1
     if not frames:
         raise structure_error(path, "holds no atoms")
     try:

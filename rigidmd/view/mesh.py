@@ -1,6 +1,6 @@
 """The surface of a single body for drawings: its solid, its points joined by rods, or a solid of the same inertia."""
 
-from itertools import pairwise, product
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -32,11 +32,6 @@ class Mesh(NamedTuple):
     def reach(self) -> float:
         """The largest distance of a vertex from the origin, m."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
-
-    @property
-    def edges(self) -> list[tuple[int, int]]:
-        sides = {tuple(sorted(side)) for face in self.faces for side in pairwise([*face, face[0]])}
-        return sorted(sides)  # pyright: ignore[reportReturnType]
 
 
 def mesh_of(system: BodySystem) -> Mesh:

@@ -164,8 +164,8 @@ def tight_boxes(result: CaseResult, quick: bool) -> None:
     """Boxes of exactly twice the cutoff, barely larger or smaller; thin slabs; one molecule, two, one too long."""
     cutoff = 6.0
 
-    def scene(edges, molecules, **more) -> dict:
-        return molecules_scene(molecules, {"lengths_A": edges}, 0.5, 200, SPLIT, 298.0, None, WATER_FORCES | more)
+    def scene(edges, molecules) -> dict:
+        return molecules_scene(molecules, {"lengths_A": edges}, 0.5, 200, SPLIT, 298.0, None, WATER_FORCES)
 
     waters = [{"model": "spce", "count": 40}]
     for size, edge in (("exactly", 2 * cutoff), ("barely larger", np.nextafter(2 * cutoff, 99))):

@@ -24,10 +24,10 @@ PUBLISHED = 10.0
 
 
 @cache
-def liquid(model: str, temperature: float, step: float, steps: int) -> State:
-    """A state of water after these steps (fs) at a temperature (K), from a lattice."""
+def liquid(model: str) -> State:
+    """A state of water after 0.5 ps at 298 K, from a lattice."""
     with np.errstate(all="ignore"):
-        return simulate(water_scene(model, step, steps, SPLIT, temperature, weak_thermostat(temperature, step))).state
+        return simulate(water_scene(model, 1.0, 500, SPLIT, 298.0, weak_thermostat(298.0, 1.0))).state
 
 
 def weak_thermostat(temperature: float, step: float) -> dict:
@@ -93,9 +93,9 @@ def run_nve(model: str, step: float, steps: int, family: str, state: State, scal
 def warm(model: str, temperature: float, step: float) -> State:
     """Liquid water at a temperature, reached from 298 K."""
     if temperature == 298.0:
-        return liquid(model, 298.0, 1.0, 500)
+        return liquid(model)
     data = water_scene(model, step, 1000, SPLIT, None, weak_thermostat(temperature, step))
-    return simulate(data, liquid(model, 298.0, 1.0, 500)).state
+    return simulate(data, liquid(model)).state
 
 
 def frozen() -> State:
@@ -149,7 +149,7 @@ def equipartition(result: CaseResult, quick: bool) -> None:
 @register(6, error="kinetic energy, standard errors from the canonical mean")
 def thermostat(result: CaseResult, quick: bool) -> None:
     """The thermostat with dt / tau from 1e-12 to 1e6: little heat when weak, the canonical mean when strong."""
-    state = liquid("spce", 298.0, 1.0, 500)
+    state = liquid("spce")
     for ratio in (1e-12, 1e6) if quick else [10.0**k for k in range(-12, 7, 3)]:
         step, steps = 0.5, 200
         heat = {"temperature_K": 298.0, "thermostat_time_ps": step / 1000 / ratio}
