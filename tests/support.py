@@ -294,8 +294,7 @@ HOMES = {
     "assemble.memory_check": "array_bytes",
     "assemble.structure": "read_structure",
     "io.structure_file": "read_atoms read_geometry",
-    "io.formats.through_ase": "EV",
-    "io.formats.traj": "TrajFile TrajReader",
+    "io.formats.through_ase": "EV TrajFile TrajReader",
     "compile": "SIMD_BITS implements call call_blocks pack_arguments",
     "compile.cache": "COMPILED CacheIndex cache_folder source_digest",
     "compile.simd": "lane_count",
@@ -469,7 +468,7 @@ MODULES = {
     "reading_process": "io.formats.through_mdanalysis",
     "watch": "run.checks",
     "wave_vectors": "forces.ewald.direct_sum",
-    "worker": "studies.sweep.worker",
+    "worker": "studies.sweep.backends",
 }
 
 

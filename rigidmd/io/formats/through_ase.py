@@ -1,15 +1,25 @@
-"""Structures from and for ASE: files that it reads, and `ase.Atoms` with the sites that have mass, in ASE's units."""
+"""Structures from and for ASE: files that it reads, `ase.Atoms` with the sites that have mass, in ASE's units, and its
+trajectories (.traj).
 
+In a trajectory, additional arrays, which ASE ignores, hold massless sites and the indices of the atoms among the sites.
+It is read item by item, and sizes are checked before arrays are allocated.
+"""
+
+import contextlib
 import io
+import os
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
-from rigidmd.io.formats import System, extensions
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, is_element, structure_error
+from rigidmd.io.formats import Format, System, extensions, register
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.units import ENERGY_UNITS
 
 if TYPE_CHECKING:
@@ -104,3 +114,176 @@ def atoms_of_sites(
     found.set_array(RESIDUE_NAMES, system.residue_names[of_atom].astype(str))
     found.set_array(RESIDUE_NUMBERS, system.residue_number[of_atom].astype(int))
     return found
+
+
+TAG = "ASE-Trajectory"
+#: Additional arrays: indices of the atoms among the sites (first frame), positions and velocities of the other sites.
+ATOMS, MASSLESS, MASSLESS_VELOCITY = "rigidmd_atoms", "rigidmd_massless", "rigidmd_massless_velocity"
+#: Bytes of the head of a file: magic number, tag, version, number of items, offset of their table.
+HEAD = 48
+#: What the library raises for damaged files.
+DAMAGE = (KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError)
+
+
+class Stored(NamedTuple):
+    """A frame of a file, in Å and ASE's unit of momentum; all arrays are float64."""
+
+    positions: np.ndarray  # (a, 3) of the atoms
+    momenta: np.ndarray | None  # (a, 3)
+    massless: np.ndarray | None  # (m, 3); None if all sites have mass
+    massless_velocity: np.ndarray | None  # (m, 3) Å/ps
+    cell: np.ndarray | None  # (3, 3); None without a box
+    time: float  # ps
+    step: int
+
+
+class TrajReader:
+    """Reads the frames of a file that rigidmd wrote. Methods raise only ValueError or OSError."""
+
+    def __init__(self, path: Path):
+        from ase.io import ulm
+
+        self._path, self._size = path, path.stat().st_size
+        with path.open("rb") as file:
+            head = np.frombuffer(file.read(HEAD)[24:], "<i8")
+        if len(head) != 3 or not 0 <= head[1] <= self._size // 8:
+            raise ValueError("not a trajectory of ASE, or damaged")
+        try:
+            self._file = ulm.Reader(path)
+        except DAMAGE as error:
+            raise ValueError(f"it is damaged: {error}") from None
+        try:
+            if self._file.get_tag() != TAG:
+                raise ValueError("not a trajectory of ASE")
+            self.count = len(self._file)
+            self._atoms = self._array(self._file, ATOMS, (-1,), np.int64) if self.count else np.zeros(0, np.int64)
+            self._mass = self._array(self._file, "masses", (len(self._atoms),)) if self.count else np.zeros(0)
+            self.sites = len(self._atoms)
+            if self.count and MASSLESS in self._file:
+                self.sites += len(self._array(self._file, MASSLESS, (-1, 3)))
+            is_inside = not len(self._atoms) or (self._atoms[0] >= 0 and self._atoms[-1] < self.sites)
+            if not np.array_equal(np.unique(self._atoms), self._atoms) or not is_inside:
+                raise ValueError("it is damaged: its indices of atoms are invalid")
+        except Exception:  # no file stays open
+            self.close()
+            raise
+
+    def close(self) -> None:
+        self._file.close()
+
+    def read(self, k: int) -> Stored:
+        try:
+            item = self._file[k]
+            cell: np.ndarray = np.array(item.cell, float)
+            info: Any = item.get("info") or {}
+            if cell.shape != (3, 3):
+                raise ValueError("it is damaged: a cell is not of shape (3, 3)")
+            n, m = len(self._atoms), self.sites - len(self._atoms)
+            wanted = {"positions": n, "momenta": n, MASSLESS: m, MASSLESS_VELOCITY: m}
+            there = {name for name in wanted if name == "positions" or name in item}
+            arrays = [self._array(item, name, (size, 3)) if name in there else None for name, size in wanted.items()]
+            return Stored._make([*arrays, cell if cell.any() else None, float(info["time_ps"]), int(info["step"])])
+        except DAMAGE as error:
+            raise ValueError(f"frame {k + 1} is damaged: {error}") from None
+
+    def frame(self, k: int) -> Frame:
+        found = self.read(k)
+        positions, velocities = self._joined(found.positions, found.massless), None
+        if found.momenta is not None:
+            velocities = self._joined(found.momenta / self._mass[:, None] * ASE_VELOCITY, found.massless_velocity)
+        return Frame(found.time, positions, found.cell, velocities, step=found.step)
+
+    def _joined(self, of_atoms: np.ndarray, others: np.ndarray | None) -> np.ndarray:
+        found = np.empty((self.sites, 3))
+        found[self._atoms] = of_atoms
+        if others is not None:
+            found[np.setdiff1d(np.arange(self.sites), self._atoms)] = others
+        return found
+
+    def _array(self, item: Any, name: str, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
+        """An array of an item with this type and shape (-1: any length)."""
+        try:
+            there = item.proxy(name)
+            fits = len(shape) == there.ndim and all(n in (-1, m) for n, m in zip(shape, there.shape, strict=False))
+            if there.dtype != kind or not fits or there.offset < 0 or there.offset + there.nbytes > self._size:
+                raise ValueError(f"it is damaged: {name} has the wrong type, shape or offset")
+            found = np.array(there.read())
+        except (AssertionError, *DAMAGE):
+            raise ValueError(f"it is damaged, or not a trajectory of rigidmd: it has no {name}") from None
+        if kind is np.float64 and not np.isfinite(found).all():
+            raise ValueError(f"it is damaged: {name} has values that are not finite")
+        return found
+
+
+class TrajFile(FrameFile):
+    """Writes ASE's .traj files of molecules, in double precision, for `ase gui` and `ase.io.read`."""
+
+    def __init__(self, path: Path, system: System, velocities: bool, wrapped: bool, kept: Sequence[int] | None = None):
+        self._massive = np.flatnonzero(system.sites.mass > 0)
+        self._massless = np.flatnonzero(system.sites.mass == 0)
+        # its symbols, masses and periodicity are the same in every frame
+        self._template = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+        super().__init__(path, system, velocities, wrapped, kept)
+
+    @property
+    def kept(self) -> tuple[int, int]:
+        with self._writing():
+            os.fsync(self._file.backend.fd.fileno())
+        return super().kept
+
+    def _frame(self, state: State, time: float, step: int) -> Stored:
+        system = self._system
+        position = system.site_positions(state, self._wrapped)
+        cell = state.cell if np.isfinite(state.cell).all() else None
+        momenta = of_massless = None
+        if self._velocities:
+            velocity = system.site_velocities(state)
+            momenta = atoms_of_sites(system, position, velocity, state.cell, time).get_momenta()
+            of_massless = velocity[self._massless]
+        massless = position[self._massless]
+        if not len(massless):
+            massless = of_massless = None
+        return Stored(position[self._massive], momenta, massless, of_massless, cell, float(time), int(step))
+
+    def _append(self, file: Any, frame: Stored) -> None:
+        atoms = self._template
+        atoms.set_positions(frame.positions)
+        if frame.cell is not None:
+            atoms.set_cell(frame.cell)
+        if frame.momenta is not None:
+            atoms.set_momenta(frame.momenta)
+        atoms.info = {"time_ps": frame.time, "step": frame.step}
+        additional = {MASSLESS: frame.massless, MASSLESS_VELOCITY: frame.massless_velocity}
+        if len(file.backend) == 0:
+            additional[ATOMS] = self._massive.astype(np.int64)
+        file.backend.write(**{name: array for name, array in additional.items() if array is not None})
+        file.write(atoms)
+
+    def _stored_frames(self, count: int) -> Iterator[Stored]:
+        sites = len(self._system.sites.mass)
+        with contextlib.closing(TrajReader(self._path)) as old:
+            if old.count < count or old.sites != sites:
+                raise ValueError(f"{count} frames of {sites} sites are needed")
+            for k in range(count):
+                yield old.read(k)
+
+    def _arrays(self, frame: Stored) -> list[np.ndarray]:
+        return [*(part for part in frame[:5] if part is not None), np.array([frame.time, float(frame.step)])]
+
+    def _open(self, path: Path, mode: str) -> Any:
+        from ase.io.trajectory import TrajectoryWriter  # slow to import
+
+        return TrajectoryWriter(path, mode)
+
+
+def read_packed(path: Path, source: Path) -> list[Callable[[], Atoms]]:
+    """The frames of any .traj of ASE, with masses that are not its standard ones."""
+    found = read_by_ase(path, source)
+    masses = [atoms.get_masses() if atoms.has("masses") else None for atoms in found]
+    return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
+
+
+register(Format(
+    (".traj",), read_packed=read_packed, writer=TrajFile, reader=TrajReader, velocities=True, double=True,
+    viewer="ase gui {trajectory}",
+))  # fmt: skip

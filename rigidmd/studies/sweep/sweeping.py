@@ -24,11 +24,10 @@ from rigidmd.run.schedule import checked_walltime
 from rigidmd.run.signals import signal_handler
 from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
-from rigidmd.studies.sweep.backends import Cluster, Pool
+from rigidmd.studies.sweep.backends import Cluster, PointResult, PointTask, Pool, Send, run_task
 from rigidmd.studies.sweep.folder import FILES, SCRIPT, Manifest, SweepPoint, is_sweep, read_manifest, write_manifest
 from rigidmd.studies.sweep.plan import Axis, axes_of, merge_manifests, order_axes, read_points, update_state, with_seeds
 from rigidmd.studies.sweep.table import Table, collect
-from rigidmd.studies.sweep.worker import PointResult, PointTask, Send, run_task
 
 #: Time that a run leaves unused at the end of the wall time of its job: seconds, and at most this fraction.
 SPARE, SPARE_FRACTION = 300.0, 0.1
