@@ -24,7 +24,7 @@ from rigidmd.errors import MoleculeError
 )  # fmt: skip
 def _models(options: Options) -> int:
     from rigidmd.scene.models import available_models, load_model, read_molecule
-    from rigidmd.view.molecule_figure import models_table, molecule_text
+    from rigidmd.view.molecule_figure import models_table, molecule_text, write_molecule_figure
 
     if options.geometry is not None:
         return _write_model(options)
@@ -42,8 +42,6 @@ def _models(options: Options) -> int:
     if not draws:
         print(molecule_text(found))
         return 0
-    from rigidmd.view.molecule_figure import write_molecule_figure
-
     path = Path(options.output or f"{Path(options.model).stem}.png")
     write_molecule_figure(path, found, options.force)
     print(f"{found.name} is drawn in {path}")

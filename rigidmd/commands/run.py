@@ -1,9 +1,10 @@
-"""`rigidmd run` and `rigidmd resume`."""
+"""Runs: `rigidmd run`, `resume` and `compare`."""
 
+import json
 import shlex
 from pathlib import Path
 
-from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
+from rigidmd.commands import BY_SIGNAL, FAILED, OUT_OF_TIME
 from rigidmd.commands.arguments import (
     SCENE,
     TRUST,
@@ -83,3 +84,19 @@ def _resume(options: Options) -> int:
     check_is_run(folder)
     options.scene, options.output = str(folder / SCENE), options.folder
     return run(options)
+
+
+@command(
+    50, "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same to "
+    "the last bit, else 1",
+    "rigidmd compare runs/water runs/water2",
+    argument("first", metavar="RUN", help="folder of a run"),
+    argument("second", metavar="RUN", help="folder of another run"),
+    argument("--json", action="store_true", help="print JSON"),
+)  # fmt: skip
+def _compare(options: Options) -> int:
+    from rigidmd.studies.compare import compare, describe_run_comparison
+
+    found = compare(Path(options.first), Path(options.second))
+    print(json.dumps(found.to_json(), indent=2) if options.json else describe_run_comparison(found))
+    return 0 if found.same else FAILED

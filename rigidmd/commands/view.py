@@ -46,9 +46,7 @@ def _film(options: Options) -> int:
 
     path = file_about_run(options, default_name(), EXTENSIONS)
     with progress_bar() as progress:
-        path, notes = write_film(
-            Path(options.folder), path, options.seconds, options.plots, options.height, progress
-        )  # fmt: skip
+        path, notes = write_film(Path(options.folder), path, options.seconds, options.plots, options.height, progress)
     for note in notes:
         print(note)
     print(f"{path}: {path.stat().st_size / 1e6:.2g} MB")

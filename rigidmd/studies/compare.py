@@ -194,18 +194,14 @@ def describe_run_comparison(found: RunComparison) -> str:
     lines = [f"{one} and {other}"]
     for name, texts in rows:
         lines += [f"  {head:<{width}}  {text}" for head, text in zip((name, *[""] * len(texts)), texts, strict=False)]
-    return "\n".join([*lines, "", _verdict(found)])
-
-
-def _verdict(found: RunComparison) -> str:
-    samples = found.samples
+    verdict, samples = "the runs are not the same", found.samples
     if found.same:
-        return "the runs are the same to the last bit"
-    if samples is not None and samples.at is not None:
-        return f"the runs diverge at {samples.clock} {samples.at}, sample {samples.index + 1} of {samples.common}"
-    if samples is not None and samples.lengths != (samples.common, samples.common):
-        return "the runs are the same to the last bit as far as both have samples"
-    return "the runs are not the same"
+        verdict = "the runs are the same to the last bit"
+    elif samples is not None and samples.at is not None:
+        verdict = f"the runs diverge at {samples.clock} {samples.at}, sample {samples.index + 1} of {samples.common}"
+    elif samples is not None and samples.lengths != (samples.common, samples.common):
+        verdict = "the runs are the same to the last bit as far as both have samples"
+    return "\n".join([*lines, "", verdict])
 
 
 def _describe_samples(samples: SampleComparison) -> list[str]:

@@ -50,7 +50,7 @@ class Format(NamedTuple):
     # A `reader` has `count` frames of `sites` sites, `frame(k)` and `close()`, and raises only OSError and ValueError.
     reader: Callable[[Path], Any] | None = None  # default: the reader of MDAnalysis
     mdanalysis: str = ""  # its name in MDAnalysis, if that is not its extension
-    check: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # `count` of frames; in another process
+    check: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # reads all frames, in another process
     times: re.Pattern[bytes] | None = None  # lines in a text of which MDAnalysis reads no (1) cell and no (2) time
     velocities: bool = False  # what it can store
     rotations: bool = False

@@ -289,13 +289,12 @@ def _labels(system: System) -> np.ndarray:
             kinds[name].add(tuple(kind))
             kinds[m.name, name].add(tuple(kind))
 
-    def label(m: Any, name: str, site: str) -> str:
-        if len(kinds[name]) == 1:
-            return name
-        return f"{m.name}.{name if len(kinds[m.name, name]) == 1 else site}"
-
     def labels(m: Any) -> np.ndarray:
-        return np.array([label(m, *names) for names in zip(names_of(m), m.site_names, strict=True)], object)
+        found = []
+        for name, site in zip(names_of(m), m.site_names, strict=True):
+            in_species = f"{m.name}.{name if len(kinds[m.name, name]) == 1 else site}"
+            found.append(name if len(kinds[name]) == 1 else in_species)
+        return np.array(found, object)
 
     return system.of_sites(labels)
 

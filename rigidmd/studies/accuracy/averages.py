@@ -143,9 +143,6 @@ class Averages:
     def __post_init__(self):
         self._fits: dict[str, BiasFit] = {}
 
-    def __repr__(self) -> str:
-        return f"<Averages of {self.name}, {self.stage}: {len(self.runs)} runs of {self.sampled:g} ps>"
-
     def points(self, quantity: AveragedQuantity) -> list[MeanAtStep]:
         return [point for run in self.runs if (point := self.point(run, quantity))]
 

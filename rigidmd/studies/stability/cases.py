@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import wraps
 from math import inf, nan
-from typing import NamedTuple, ParamSpec
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from rigidmd.run import Simulation
 from rigidmd.run.results import Results
 from rigidmd.run.summary import LARGE_ENERGY_ERROR
 from rigidmd.scene import MolecularScene, Scene
-
-P = ParamSpec("P")
 
 RIGHT, REFUSED, REPORTED, UNDETECTED, CRASH = "right", "refused", "reported", "undetected", "crash"
 #: Meaning of each verdict; the last two are failures.
@@ -203,11 +201,11 @@ def families(quick: bool) -> tuple[str, ...]:
     return QUICK if quick else tuple(FAMILIES)
 
 
-def attempt(run: Callable[P, Outcome]) -> Callable[P, Outcome]:
+def attempt(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
     """A run whose errors are outcomes: one of rigidmd becomes a message, any other exception a crash."""
 
     @wraps(run)
-    def attempted(*arguments: P.args, **options: P.kwargs) -> Outcome:
+    def attempted(*arguments: Any, **options: Any) -> Outcome:
         began = clock.perf_counter()
         try:
             with np.errstate(all="ignore"):

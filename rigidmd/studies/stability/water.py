@@ -61,7 +61,8 @@ def water_steps(result: CaseResult, quick: bool) -> None:
             span = (500 if quick else 1000) * step
 
             def at(h: float, family=family, state=state, scale=scale, span=span) -> Outcome:
-                return run_nve("spce", h, max(200, round(span / h)), family, state, scale)
+                data = water_scene("spce", h, max(200, round(span / h)), family, 0.0)
+                return run_molecules(data, state, scale=scale)
 
             result.add(f"{temperature:g} K", at(step), 0.02, family, step)
             result.limits.append(longest_step(at, step, f"{temperature:g} K", family))
@@ -75,7 +76,8 @@ def tip4p_steps(result: CaseResult, quick: bool) -> None:
     for family in (SPLIT,) if quick else QUICK:
 
         def at(h: float, family=family) -> Outcome:
-            return run_nve("tip4p", h, 300 if quick else 1000, family, state, scale)
+            data = water_scene("tip4p", h, 300 if quick else 1000, family, 0.0)
+            return run_molecules(data, state, scale=scale)
 
         for step in STEPS[:1] if quick else STEPS:
             allowed, expected = 0.02 if step <= 1 else 1.0, (RIGHT, REPORTED, REFUSED)
@@ -84,10 +86,6 @@ def tip4p_steps(result: CaseResult, quick: bool) -> None:
         result.limits.append(limit)
         published = f"(published for rigid TIP4P: near {PUBLISHED:g} fs)"
         result.notes.append(f"{family}: bounded to {limit.longest:.3g} fs {published}")
-
-
-def run_nve(model: str, step: float, steps: int, family: str, state: State, scale: float) -> Outcome:
-    return run_molecules(water_scene(model, step, steps, family, 0.0), state, scale=scale)
 
 
 def warm(model: str, temperature: float, step: float) -> State:
