@@ -128,8 +128,7 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
             table = {title: read.numbers(title) for title in read.cells}
             columns = {t: table[t] for t in rest if t.removesuffix(" error") not in table.keys() - {t}}
             errors = {t.removesuffix(" error"): table[t] for t in rest if t not in columns}
-            axis = (head, table[head])
-            curves.append(Curve(**described.model_dump(), axis=axis, columns=columns, errors=errors))
+            curves.append(Curve(**described.model_dump(), axis=(head, table[head]), columns=columns, errors=errors))
         phrase = f"{used.frames} frames from {used.from_ps:g} to {used.to_ps:g} ps"
         found.append((AnalysisResult(name, entry.about, entry.values, curves, entry.notes), phrase))
     return found

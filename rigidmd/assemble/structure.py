@@ -125,8 +125,7 @@ def _read_molecules(
 ) -> Configuration:
     known = list(dict.fromkeys(name for m in species for name in (*m.site_names, *m.elements)))
     hint = f"is not a site or element of the scene's molecules; there are {', '.join(known)}"
-    unknown = [(number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")]
-    if unknown:
+    if unknown := [(number, name) for number, name in (atom_types or {}).items() if name not in (*known, "X")]:
         faults = [f"structure.atom_types.{k} = {name!r} {hint}{did_you_mean(name, known)}" for k, name in unknown]
         raise StructureError(str(path), faults)
     atoms = read_atoms(path, frame, atom_types, topology, content)
@@ -181,8 +180,7 @@ def _unknown_masses(atoms: Atoms, species: list[Molecule]) -> list[str]:
     ]
     there = f"the scene's molecules ({', '.join(f'{mass:g}' for mass in masses)} u)"
     advice = "set structure.atom_types, or these masses by masses_u"
-    fault = f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"
-    return [fault] if unknown else []
+    return [f"its atom types {', '.join(unknown)} have masses of no site of {there}: {advice}"] if unknown else []
 
 
 def _notes(atoms: Atoms, matched: MatchedMolecules, species: list[Molecule]) -> Iterator[str]:

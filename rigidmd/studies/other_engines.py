@@ -72,8 +72,7 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
 
 def start_of(system: System) -> State:
     """The state after overlap removal and the first minimisations, by rigidmd itself."""
-    scene = system.scene.model_copy(update={"engine": EngineChoice()})
-    return Simulation(scene, warn=lambda sentence: None).settle()
+    return Simulation(system.scene.model_copy(update={"engine": EngineChoice()}), warn=lambda sentence: None).settle()
 
 
 STEPS, STEP = 50, 1.0  # number of steps of the short run, and their length, fs

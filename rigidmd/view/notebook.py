@@ -112,8 +112,7 @@ def _molecular_rows(scene: MolecularScene) -> Iterable[TableRow]:
     species = species_of(scene)
     for entry, molecule in zip(scene.molecules, species, strict=True):
         count = f"{entry.count} " if entry.count else ""
-        frozen = ", frozen" if entry.frozen else ""
-        yield "molecules", f"{count}{molecule.name}: {molecule.description}{frozen}"
+        yield "molecules", f"{count}{molecule.name}: {molecule.description}{', frozen' if entry.frozen else ''}"
     if scene.structure is not None:
         yield "start", f"from {scene.structure.file}"
     yield "box", _box(scene)

@@ -247,8 +247,7 @@ class LivePlot(Observer):
         default = MOLECULES if "drift" in described else [name for name in BODY if name in described][:1]
         names = self._columns or default
         check_names(names, described)
-        record = record_of(self._run.system, samples, None, names)
-        png, size = columns_figure(record, names, described).png()
+        png, size = columns_figure(record_of(self._run.system, samples, None, names), names, described).png()
         self._spot.show({"image/png": png, "text/plain": f"{', '.join(names)} against time"}, {"image/png": size})
         now = clock.monotonic()
         self._due = now + max(self._pause, (now - began) * (1 / TIME_FRACTION - 1))

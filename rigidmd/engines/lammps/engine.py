@@ -180,8 +180,7 @@ class LammpsEngine(ExternalEngine):
                 found["coulomb_background"] = even
         elif isinstance(law, DampedShiftedForce):
             found["coulomb"] -= (0.5 * law.shift - law.alpha / np.sqrt(np.pi)) * float(charge @ charge)
-        zero = np.zeros((3, 3))
-        return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
+        return {name: Tally(float(u), np.zeros((3, 3)) if k else virial) for k, (name, u) in enumerate(found.items())}
 
 
 class Process:
@@ -216,8 +215,7 @@ class Process:
                 return [float(figure) for figure in line[len(NUMBERS) :].split()]
             output.append(line.strip())
         messages = [line for line in output if "ERROR" in line] or [line for line in output if line][-3:]
-        runs = any(line.startswith("run ") and line != "run 0" for line in lines)
-        kind = SimulationError if runs else EngineError
+        kind = SimulationError if any(line.startswith("run ") and line != "run 0" for line in lines) else EngineError
         raise kind(f"LAMMPS stopped: {'; '.join(messages) or f'exit code {self._process.wait()}'}")
 
     def close(self) -> None:

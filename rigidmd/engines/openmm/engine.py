@@ -190,8 +190,7 @@ class OpenmmEngine(ExternalEngine):
                 found["coulomb_background"] = even
         elif law is not None:
             found["coulomb"] = energy(Group.COULOMB_PAIRS)
-        zero = np.zeros((3, 3))
-        return {name: Tally(float(u), zero if k else virial) for k, (name, u) in enumerate(found.items())}
+        return {name: Tally(float(u), np.zeros((3, 3)) if k else virial) for k, (name, u) in enumerate(found.items())}
 
     def _excluded_energy(self, state: State, alpha: float) -> float:
         """The reciprocal energy of excluded pairs, which OpenMM subtracts."""

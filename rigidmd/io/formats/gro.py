@@ -20,12 +20,11 @@ def read_gro(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
     frames, first = [], 0
     while first < len(lines):
         promised = lines[first + 1].strip() if first + 1 < len(lines) else ""
-        if not lines[first].strip() and parse_whole_number(promised) is None:  # an empty line, not an empty title
-            first += 1
+        if (count := parse_whole_number(promised)) is None:
+            if lines[first].strip():
+                raise unexpected(path, first + 2, "the number of atoms", promised)
+            first += 1  # an empty line, not an empty title
             continue
-        count = parse_whole_number(promised)
-        if count is None:
-            raise unexpected(path, first + 2, "the number of atoms", promised)
         box = first + 2 + count
         if box >= len(lines):
             found = f"{max(0, len(lines) - first - 3)} are there: truncated?"

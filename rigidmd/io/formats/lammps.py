@@ -84,8 +84,7 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
             names[kind] = row.comment
     declared = next((row.words[0] for row in head if row.words[1:] == ["atom", "types"]), "0")
     numbered = range(1, 1 + min(parse_whole_number(declared) or 0, len(rows)))
-    known = {*mass_of, *labels, *number_of, *map(str, numbered)}
-    column = _columns(path, style, rows, known)
+    column = _columns(path, style, rows, {*mass_of, *labels, *number_of, *map(str, numbered)})
     width, whole = len(column), [column[name] for name in ("id", "mol") if name in column]
     for line, words, _ in rows:
         if len(words) < width or any(parse_whole_number(words[k]) is None for k in whole):

@@ -85,8 +85,7 @@ def measure_accuracy(
         name: timesteps or [base * rung * trial_system.methods[name].force_evaluations for rung in LADDER]
         for name in integrators
     }
-    trials = plan(trial_system, steps)
-    found = measure(trial_system, trials, repeats, progress=progress, extend=not timesteps)
+    found = measure(trial_system, plan(trial_system, steps), repeats, progress=progress, extend=not timesteps)
     found.left_out = left_out
     return found
 

@@ -153,8 +153,7 @@ def averages_figure(found: Averages):
         axis.axhspan(-limit, limit, color=FAINT, alpha=0.15, lw=0)
         axis.axhline(0, color=INK, lw=0.7)
         for method, runs in groupby(found.runs, key=lambda run: run.method):
-            at = [(run.timestep, *bias) for run in runs if (bias := found.bias(run, quantity))]
-            if at:
+            if at := [(run.timestep, *bias) for run in runs if (bias := found.bias(run, quantity))]:
                 steps, values, errors = zip(*at, strict=True)
                 style = curve_style(methods.index(method))
                 handles[method] = axis.errorbar(steps, values, errors, ms=3.5, lw=1.1, capsize=2, **style)

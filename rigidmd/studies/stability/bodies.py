@@ -66,8 +66,7 @@ def free(inertia, omega=OMEGA) -> dict:
 
 def exponents(first: int, last: int, quick: bool) -> list[int]:
     """-first ... -last, all or four of them."""
-    every = range(first, last + 1)
-    return [-k for k in (every if not quick else np.unique(np.linspace(first, last, 4).astype(int)))]
+    return [-k for k in (np.unique(np.linspace(first, last, 4).astype(int)) if quick else range(first, last + 1))]
 
 
 def compare_with_dop853(result: CaseResult, quick: bool, settings: list[tuple[str, tuple, tuple]]) -> None:
@@ -130,8 +129,7 @@ def along_axes(result: CaseResult, quick: bool) -> None:
     for k in range(3):
         aside = np.roll([0.0, 0.6, 0.8], k)
         offs = [0.0] + [10.0**e for e in exponents(2, 16, quick)]
-        axis = np.eye(3)[k]
-        settings = [(f"axis {k + 1}, off by {off:.0e}", inertia, axis + off * aside) for off in offs]
+        settings = [(f"axis {k + 1}, off by {off:.0e}", inertia, np.eye(3)[k] + off * aside) for off in offs]
         compare_with_dop853(result, quick, settings)
     for family in families(quick):
         outcome = run_body(free(inertia, (0, 0, 0)), STEP, SPAN, family, rotation_error(np.eye(3)))

@@ -158,8 +158,7 @@ def longest_step(
         is_bounded(2 * bad)
         is_bounded(4 * bad)
         ways = {failure(outcome): outcome for step, outcome in seen.items() if step >= bad}
-        order = (CRASH, UNDETECTED, "blow-up", "drift", "detected")
-        beyond = next(way for way in order if way in ways)
+        beyond = next(way for way in (CRASH, UNDETECTED, "blow-up", "drift", "detected") if way in ways)
         message = ways[beyond].crash or ways[beyond].message
     seconds = sum(outcome.seconds for outcome in seen.values())
     return StepLimit(setting, family, inf if bad == inf else good, beyond, message, seconds, max(seen))
