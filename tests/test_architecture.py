@@ -173,7 +173,7 @@ def test_only_a_format_names_its_extensions():
             naming[name_of(path)] = found
     strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
     assert set(strange) == set(NAMED_EXTENSIONS), strange
-    assert len(naming) > len(strange) + 8
+    assert len(naming) >= len(strange) + 8  # the registry and seven modules
 
 
 def is_compiled(name):
