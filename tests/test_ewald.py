@@ -868,6 +868,7 @@ cutoff_A = 6
 electrostatics = "reaction_field"
 truncation = "shift"
 reaction_field_truncation = "{truncation}"
+tail_correction = false
 [start]
 temperature_K = 300
 [[stages]]
