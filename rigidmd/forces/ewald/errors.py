@@ -10,7 +10,6 @@ from math import exp, inf, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 #: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16 they are good to 5 %.
@@ -85,6 +84,8 @@ def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) 
 
 def k_cutoff_for(charges: Charges, alpha: float, reciprocal: np.ndarray, error: float) -> float:
     """The cutoff radius in k (1/Å) at which the k-vectors beyond it cause this error."""
+    from scipy.optimize import brentq  # slow to import, and for direct sums only
+
     volume = 8 * pi**3 / abs(np.linalg.det(reciprocal))
     least = np.linalg.norm(reciprocal, axis=1).min()
     longest = 12 * alpha + least
