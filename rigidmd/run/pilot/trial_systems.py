@@ -99,8 +99,7 @@ def molecular_trial_system(system: System, start: State, rotor: str | None, span
         energy_size=freedom * thermal or 1.0, kinetic=kinetic or 1.0, span=span, time_unit="fs", time_size=FEMTOSECOND,
         length_unit="Å", reference="srkn_6", conserved_errors=conserved_errors, can_continue=True,
         refused={name: "it is for single bodies" for name in COMPARATORS},
-        observe=(lambda engine, now, step: observe(system, engine, now, verlet_step=step)) if boxed else None,
-        molecules=len(system.model.species), freedom=freedom, chooses_precision=bool(system.precision_reason),
+        freedom=freedom, chooses_precision=bool(system.precision_reason),
     )  # fmt: skip
 
 

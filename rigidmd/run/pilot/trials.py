@@ -1,7 +1,7 @@
 """Trials of integrators: runs from the same start at several time steps, for pilot runs and `rigidmd accuracy`.
 
 The cost is seconds of computing and force evaluations for a span of time. Errors of the trajectory are measured at the
-end, of conserved quantities on the way and, for liquids on request, of averages of temperatures, energy and pressure.
+end, of conserved quantities on the way.
 """
 
 import time as clock
@@ -15,8 +15,7 @@ import numpy as np
 
 from rigidmd.core.integrators import RK4, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.core.statistics import mean_and_error, slope
-from rigidmd.engines.observables import Observation
+from rigidmd.core.statistics import slope
 from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
 from rigidmd.mechanics.rotation import orthogonality_error
@@ -25,8 +24,6 @@ from rigidmd.mechanics.rotation import orthogonality_error
 OBSERVATIONS = 40
 #: A run diverges if its energy error exceeds this fraction of the kinetic energy.
 DIVERGED = 0.5
-#: Time between samples of averages, ps: about the correlation time of the kinetic energy of water.
-SAMPLING_INTERVAL_PS = 0.02
 #: Fraction of an integrator's longest stable step that is recommended, where a longer one diverges.
 STABLE_FRACTION = 0.8
 #: Least steps in a span of a trial that extends the steps of an integrator.
@@ -62,7 +59,7 @@ class Method(NamedTuple):
 
 @dataclass
 class TrialSystem:
-    """A start, and how to measure errors on it. Functions have the arguments engine, state and, of `observe`, step.
+    """A start, and how to measure errors on it. Functions have the arguments engine and state.
 
     energy : the conserved energy; energy_unit, energy_note : the unit of its reported error, as text
     energy_size : that unit in the units of `energy`; kinetic : kinetic energy that sets the limit of divergence
@@ -70,7 +67,6 @@ class TrialSystem:
     conserved_errors : relative errors of other conserved quantities, of a state
     can_continue : whether timing may continue beyond the span instead of starting again
     refused : name -> reason, of methods that cannot move this system; singular : names of those singular at the start
-    observe : the averaged observables of molecules in a box; None for others
     rounding : relative rms errors of forces and torques in mixed precision; None in double
     chooses_precision : whether each trial has the precision that suits the error of its step
     """
@@ -92,8 +88,6 @@ class TrialSystem:
     can_continue: bool
     refused: dict[str, str] = field(default_factory=dict)
     singular: tuple[str, ...] = ()
-    observe: Callable[[Engine, State, float], Observation] | None = None
-    molecules: int = 1
     freedom: int = 1
     rounding: tuple[float, float] | None = None
     chooses_precision: bool = False
@@ -117,7 +111,6 @@ class Trial:
     conserved_errors: dict[str, float] = field(default_factory=dict)  # largest relative ones, of other quantities
     tolerance: float | None = None  # of a method that chooses its steps
     failure: str = ""  # why it failed or diverged
-    averages: dict[str, tuple[float, float]] = field(default_factory=dict)  # name -> mean, standard error
     energies: list[float] = field(default_factory=list, repr=False)  # errors, from 0 at the start
 
     @property
@@ -148,16 +141,10 @@ class IntegratorAccuracy:
     trials: list[Trial]
     reference_steps: int
     reference_error: float  # of the reference, from a run with half as many steps
-    sampled: float | None = None  # ps of averaging
     left_out: dict[str, str] = field(default_factory=dict)  # usual methods that were not tried -> reason
 
     def __repr__(self) -> str:
         return f"<Precision of {self.trial_system.name}: {len(self.trials)} trials>"
-
-    @property
-    def most_exact(self) -> Trial:
-        """The trial with the smallest energy error, whose averages are the reference of other trials."""
-        return min((t for t in self.trials if t.averages), key=lambda t: t.energy_rms)
 
     def stable_step(self, integrator: str) -> float | None:
         steps = [trial.timestep for trial in self.trials if trial.integrator == integrator and not trial.diverged]
@@ -207,34 +194,29 @@ class ReachedError(NamedTuple):
 
 
 def measure(
-    system: TrialSystem, trials: list[Trial], repeats: int, averages: float | None = None,
+    system: TrialSystem, trials: list[Trial], repeats: int,
     progress: Callable[[float], object] = lambda fraction: None, extend: bool = False,
 ) -> IntegratorAccuracy:  # fmt: skip
     """Run all trials and the reference; time the trials alternately `repeats` times.
 
-    averages : ps over which every trial is also averaged, or None; progress : called with the fraction done
+    progress : called with the fraction done
     extend : whether longer steps than the longest one of each integrator are tried, doubled until one fails
     """
     most = max((trial.forces for trial in trials), default=0) or OBSERVATIONS * OBSERVATIONS
     steps = 2 * -(-2 * most // system.methods[system.reference].force_evaluations)
     exact = final_state(system, steps)
     differences = state_difference(exact, final_state(system, steps // 2))
-    result = IntegratorAccuracy(system, trials, steps, max(x for x in differences if not np.isnan(x)), averages)
+    result = IntegratorAccuracy(system, trials, steps, max(x for x in differences if not np.isnan(x)))
     for trial in trials:  # compile and measure errors
         measure_errors(system, trial, exact)
     if extend:
         result.trials = trials = _extended(system, trials, exact)
     good = [trial for trial in trials if not trial.diverged]
-    done, whole = 0.0, len(good) * (repeats + (averages or 0.0) / system.span)
+    done, whole = 0.0, len(good) * repeats
     for _ in range(repeats):
         for trial in good:
             trial.seconds.append(time_span(system, trial))
             done += 1
-            progress(done / whole)
-    if averages:
-        for trial in good:
-            _average(system, trial, averages)
-            done += averages / system.span
             progress(done / whole)
     return result
 
@@ -378,36 +360,3 @@ def measure_errors(system: TrialSystem, trial: Trial, exact: State | None, obser
     if (chosen := engine.chosen_steps) is not None:
         count, trial.forces = chosen
         trial.timestep = system.span / count / system.time_size
-
-
-def _average(system: TrialSystem, trial: Trial, length: float) -> None:
-    """Average over a run of `length` ps from the start; temperatures at steps, between kicks, and unbiased."""
-    observe = system.observe
-    if observe is None:
-        raise ValueError("averages are for molecules in a box")
-    engine, state, advance_to = _begin_trial(system, trial)
-    dt = trial.timestep * system.time_size
-    verlet_step = dt if trial.integrator == "velocity_verlet" else np.nan
-    every = max(1, round(SAMPLING_INTERVAL_PS / dt))
-    seen: list[Observation] = []
-    for k in range(max(2, round(length / dt / every))):
-        try:
-            advance_to((k + 1) * every)
-        except SimulationError:
-            return
-        seen.append(observe(engine, state, verlet_step))
-
-    def series(name: str) -> np.ndarray:
-        return np.array([getattr(observation, name) for observation in seen])
-
-    found = {"potential": series("potential") / system.molecules, "pressure": series("pressure_bar")}
-    for name, key in (("T_trans", "translation"), ("T_rot", "rotation")):
-        on, unbiased = series(f"temperature_{key}"), series(f"temperature_{key}_unbiased")
-        # unbiased = (on the steps + twice between the kicks)/3
-        found |= {name: on, f"{name} half-step": 1.5 * unbiased - 0.5 * on, f"{name} unbiased": unbiased}
-    for kind in ("", " half-step", " unbiased"):
-        found[f"T_rot - T_trans{kind}"] = found[f"T_rot{kind}"] - found[f"T_trans{kind}"]
-    for name, values in found.items():
-        average, error = mean_and_error(values)
-        if average is not None:
-            trial.averages[name] = average, np.nan if error is None else error
