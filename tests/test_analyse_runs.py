@@ -185,7 +185,7 @@ def test_g_of_r_is_that_of_mdanalysis(water):
         peer = InterRDF(*selected, nbins=90, range=(0, 9.0), exclusion_block=block).run(start=first)
         found = registry.selected(["rdf"])[0].function(history, a, b, 9.0, 0.1)[f"g {a}-{b}"]
         assert np.abs(found - peer.results.rdf).max() < 1e-3  # a pair at the edge of a bin
-        assert np.abs(found - peer.results.rdf).mean() < 1e-5
+        assert np.sum(np.abs(found - peer.results.rdf) > 1e-6) <= 4  # two such pairs
 
 
 def test_displacements_are_those_of_mdanalysis(water):
