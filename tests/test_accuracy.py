@@ -117,7 +117,7 @@ def clockwork(monkeypatch):
 
     def trial_system(can_continue, lasts=10**9):
         made = []
-        method = Method(lambda: Clockwork(made, lasts), SCHEMES["velocity_verlet"])
+        method = Method(lambda timestep: Clockwork(made, lasts), SCHEMES["velocity_verlet"])
         own, _ = body_trial_system(Scene.read(TOP), 0.1)
         return dataclasses.replace(own, methods={"velocity_verlet": method}, can_continue=can_continue), made
 
@@ -488,7 +488,12 @@ def test_what_else_is_kept_is_shown(top):
     assert set(verlet.conserved_errors) == {"L_z", "L_3"}
     assert max(verlet.conserved_errors.values()) < 1e-12
     assert "L_z" in table_text(top).splitlines()[1]
-    dimer = measure_accuracy(Scene.read(ROOT / "systems" / "water_dimer.toml"), ["velocity_verlet"], [1.0], repeats=1)
+    dimer = measure_accuracy(
+        Scene.read(ROOT / "systems" / "water_dimer.toml", {"precision": "double"}),
+        ["velocity_verlet"],
+        [1.0],
+        repeats=1,
+    )
     assert set(dimer.trials[0].conserved_errors) == {"momentum", "L"}
     assert max(dimer.trials[0].conserved_errors.values()) < 1e-11
 

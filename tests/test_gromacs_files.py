@@ -153,7 +153,7 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     system = build(small_scene(counts, 16.0, stages=stages, forces={"cutoff_A": 6.0, "truncation": "smooth_switch"}))
     messages = " ".join(table.refusals(force_field_of(system)))
     for words in (
-        "smooth_switch", "with reaction_field", "no rigid bodies whose mass", "one kind of triangle", "andersen",
+        "forces.truncation = 'smooth_switch'", "forces.reaction_field_truncation = 'smooth_switch'", "no rigid bodies whose mass", "one kind of triangle", "andersen",
         "monte_carlo", "yoshida_4",
     ):  # fmt: skip
         assert words in messages

@@ -135,7 +135,7 @@ def test_scenes_and_results_show_tables_and_a_figure(tmp_path):
     for part in (
         "216 spce: asymmetric, planar",
         "0.997 g/cm³",
-        "reaction field",
+        "particle mesh Ewald",
         "production: 20000 steps of 1 fs = 20 ps",
     ):
         assert part in water

@@ -225,7 +225,7 @@ def test_the_summary_tells_what_a_run_was_made_with(stopped):
     told = json.loads((stopped / "run" / "summary.json").read_text())
     for package in ("numba", "llvmlite", "numpy"):
         assert told[f"{package}_version"] == version(package)
-    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (1, "double", 1, {})
+    assert (told["seed"], told["precision"], told["threads"], told["input_sha256"]) == (1, "mixed", 1, {})
     assert "64bit" in told["processor_features"] or platform.machine() not in ("x86_64", "AMD64")
     own = Scene.read(stopped / "run" / "scene.toml", {"threads": 2, "name": "other"})
     assert provenance.scene_digest(own) == told["scene_sha256"]

@@ -372,4 +372,4 @@ def test_check_says_how_many_threads_compute(asked, words):
     command += [] if asked is None else ["--set", f"threads={asked}"]
     environment = os.environ | {"NUMBA_NUM_THREADS": "2"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert f"computing: {words}, double precision" in done.stdout, done.stderr
+    assert f"computing: {words}, mixed precision" in done.stdout, done.stderr

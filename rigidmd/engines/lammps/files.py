@@ -233,9 +233,15 @@ def input_script(view: ForceFieldView) -> str:
     hint = "# Written by rigidmd. Run it here:  lmp -in in.lammps   or   mpirun -n 4 lmp -in in.lammps"
     lines = [f"# {in_comment(system.scene.in_short)}", hint, "", f"include {SETTINGS}", ""]
     columns = "step time temp pe ke etotal press vol density"
+    added = []
     if (constant := system.constants.get("coulomb_intramolecular")) is not None:
         what = "pairs within molecules in reciprocal space, constant for rigid molecules; potential does not"
-        lines += [f"# pe includes {what}", f"variable potential equal pe+({_num(constant / KCAL)})"]
+        lines, added = [*lines, f"# pe includes {what}"], [f"({_num(constant / KCAL)})"]
+    if system.tail is not None:
+        lines += ["# potential includes Lennard-Jones beyond the cutoff, pe and press do not"]
+        added += [f"({_num(system.tail.energy_volume / KCAL)})/vol"]
+    if added:
+        lines += [f"variable potential equal {'+'.join(['pe', *added])}"]
         columns += " v_potential"
     lines += [f"thermo_style custom {columns}", "thermo_modify format float %.10g flush yes"]
     for k, stage in enumerate(system.scene.stages):

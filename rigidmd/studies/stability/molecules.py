@@ -189,6 +189,7 @@ def far_away(result: CaseResult, quick: bool) -> None:
     edge = 16.0  # a power of two, so that shifts by whole boxes are exact while digits last
     waters = [{"model": "spce", "count": 40}]
     data = molecules_scene(waters, {"lengths_A": edge}, 0.5, 10, SPLIT, 298.0, None, WATER_FORCES)
+    data["precision"] = "double"  # rounding is compared
     system = build(MolecularScene.from_dict(data))
     state = system.state.copy()
     state.position[:] = np.round(state.position * 2**10) / 2**10
