@@ -141,8 +141,8 @@ def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expe
     "tables",
     [
         {"molecules": [WATER, {"model": "argon", "count": 2, "frozen": True}]},
-        {"box": {"lengths_A": [13.0, 13.0, 30.0]}, "fields": {"walls": [{"axis": "z", "positions_A": [0.0, 13.0], "kind": "harmonic",
-                               "stiffness_kJ_mol_A2": 100.0}]}},
+        {"box": {"lengths_A": [13.0, 13.0, 30.0]}, "fields": {"walls": [
+            {"axis": "z", "positions_A": [0.0, 13.0], "kind": "harmonic", "stiffness_kJ_mol_A2": 100.0}]}},
         {"forces": {"cutoff_A": 6.0, "lennard_jones": False}},
     ],
 )  # fmt: skip
