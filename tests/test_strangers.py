@@ -269,7 +269,7 @@ def test_a_terminal_without_the_letters_ends_no_command(monkeypatch, tmp_path):
         (GOOD.replace("count = 20", f"count = {2**63 - 1}"), "not enough memory: a system of 9223372036854775807"),
         (
             GOOD + '[forces]\nelectrostatics = "pme"\npme_grid = [4096, 4096, 4096]\n',
-            "a single array of it needs 551 GB",
+            "a single array of it needs 275 GB",
         ),
     ],
 )
