@@ -188,7 +188,7 @@ def far_away(result: CaseResult, quick: bool) -> None:
     """Molecules on a face, and shifted by whole boxes of 1e3 to 1e300 Å: the same forces to rounding, or refused."""
     edge = 16.0  # a power of two, so that shifts by whole boxes are exact while digits last
     waters = [{"model": "spce", "count": 40}]
-    # rounding is compared, beside which the grid of PME and single precision are coarse
+    # rounding is compared, which the grid of PME and single precision would hide
     forces = WATER_FORCES | {"electrostatics": "reaction_field"}
     data = molecules_scene(waters, {"lengths_A": edge}, 0.5, 10, SPLIT, 298.0, None, forces) | {"precision": "double"}
     system = build(MolecularScene.from_dict(data))
