@@ -157,8 +157,8 @@ def with_precision(
         k = min(errors, key=lambda k: errors[k])
         precision, stage = precision_for(errors[k]), scene.stages[k]
         why = (
-            f"{stage.integrator} at {stage.timestep_fs:g} fs has an error of about {errors[k]:.1e} of the forces, "
-            f"{'at least' if precision == 'mixed' else 'less than'} {MARGIN} times that of single precision between "
-            f"sites, {MIXED_ERROR:.0e}"
+            f"the error of {stage.integrator} at {stage.timestep_fs:g} fs, about {errors[k]:.0e} of the forces, is "
+            f"{errors[k] / MIXED_ERROR:,.0f} times that of single precision, {MIXED_ERROR:.0e}"
+            f"{'' if precision == 'mixed' else f', and not {MARGIN} times'}"
         )
     return scene.model_copy(update={"precision": precision}), why
