@@ -1,6 +1,4 @@
-"""`rigidmd help` and `rigidmd schema`."""
-
-import json
+"""`rigidmd help`."""
 
 from rigidmd.commands.arguments import Options, argument, command
 
@@ -20,12 +18,4 @@ def _help(options: Options) -> int:
     print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
     for name, about in found.items():
         print(f"  {name:<{width}}  {about}")
-    return 0
-
-
-@command(180, "print the JSON schema of scenes, for editors", "rigidmd schema > scene.schema.json")
-def _schema(options: Options) -> int:
-    from rigidmd.scene import schema
-
-    print(json.dumps(schema(), indent=2, allow_nan=False))
     return 0

@@ -1,30 +1,9 @@
-"""`rigidmd examples` and `rigidmd new`."""
+"""`rigidmd new`."""
 
 import shlex
 from pathlib import Path
 
 from rigidmd.commands.arguments import Options, argument, command
-
-
-@command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
-def _examples(options: Options) -> int:
-    from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples, examples_in
-
-    scenes = examples()
-    kinds = {
-        "molecules": [example for example in scenes if not example.is_body],
-        "one body": [example for example in scenes if example.is_body],
-        "notebooks": examples_in(NOTEBOOKS),
-        "scripts, which extend it": examples_in(SCRIPTS),
-    }
-    width = max(len(example.name) for example in scenes)
-    for title, found in kinds.items():
-        print(f"{title}:")
-        for example in found:
-            print(f"  {example.name:<{width}}  {example.about}")
-        print()
-    print("`rigidmd new NAME` copies one into the working directory")
-    return 0
 
 
 @command(

@@ -1,21 +1,10 @@
-"""Runs: `rigidmd run`, `resume` and `compare`."""
+"""`rigidmd run`."""
 
-import json
 import shlex
 from pathlib import Path
 
-from rigidmd.commands import BY_SIGNAL, FAILED, OUT_OF_TIME
-from rigidmd.commands.arguments import (
-    SCENE,
-    TRUST,
-    Options,
-    add_engine,
-    argument,
-    command,
-    read_scene,
-    seconds,
-    time_ps,
-)
+from rigidmd.commands import BY_SIGNAL, OUT_OF_TIME
+from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene, seconds, time_ps
 from rigidmd.commands.streams import announce, warn
 from rigidmd.errors import SceneError
 
@@ -70,33 +59,3 @@ def run(options: Options) -> int:
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0
-
-
-@command(
-    40, "continue a run that was stopped", "rigidmd resume runs/water --until 200ps",
-    argument("folder", metavar="DIR", help="folder of the run"), TRUST, *DURATION,
-    overrides=[], force=False, resume=True, writes=True,
-)  # fmt: skip
-def _resume(options: Options) -> int:
-    from rigidmd.io.folder import SCENE, check_is_run
-
-    folder = Path(options.folder)
-    check_is_run(folder)
-    options.scene, options.output = str(folder / SCENE), options.folder
-    return run(options)
-
-
-@command(
-    50, "report where two runs diverge and how their inputs and versions differ; exit code 0 if they are the same to "
-    "the last bit, else 1",
-    "rigidmd compare runs/water runs/water2",
-    argument("first", metavar="RUN", help="folder of a run"),
-    argument("second", metavar="RUN", help="folder of another run"),
-    argument("--json", action="store_true", help="print JSON"),
-)  # fmt: skip
-def _compare(options: Options) -> int:
-    from rigidmd.studies.compare import compare, describe_run_comparison
-
-    found = compare(Path(options.first), Path(options.second))
-    print(json.dumps(found.to_json(), indent=2) if options.json else describe_run_comparison(found))
-    return 0 if found.same else FAILED

@@ -1,34 +1,11 @@
-"""Other engines: `rigidmd export` and `rigidmd verify`."""
+"""`rigidmd verify`."""
 
 import argparse
 import json
-import shlex
-from pathlib import Path
 
 from rigidmd.commands import FAILED
-from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, output_folder, read_scene
-from rigidmd.engines.registry import programs, runnable
-
-
-@command(
-    80, "write a scene as a folder that runs on another engine by itself",
-    "rigidmd export water_pme.toml --to lammps -o water_lammps", *SCENE,
-    lambda parser: parser.add_argument(
-        "--to", required=True, choices=[name for name, of in programs().items() if of.writer], help="the engine"
-    ),
-    *output_folder("NAME-ENGINE", "an earlier export"), writes=True,
-)  # fmt: skip
-def _export(options: Options) -> int:
-    from rigidmd.studies.other_engines import export
-
-    scene = read_scene(options)
-    folder = Path(options.output or f"{scene.name}-{options.to}")
-    done = export(scene, options.to, folder, options.force)
-    print(f"{scene.name} for {done.title} in {folder}: {', '.join(done.files)}")
-    for note in done.notes:
-        print(f"  {note}")
-    print(f"next:\n  cd {shlex.quote(str(folder))} && {done.command}")
-    return 0
+from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
+from rigidmd.engines.registry import runnable
 
 
 def _engine(parser: argparse.ArgumentParser) -> None:

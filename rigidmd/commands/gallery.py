@@ -1,0 +1,29 @@
+"""`rigidmd gallery`."""
+
+import shlex
+from pathlib import Path
+
+from rigidmd.commands.arguments import Options, argument, command, print_page
+from rigidmd.commands.streams import announce
+
+
+@command(
+    160, "run shipped bodies and write a page with a picture of each, which leads to its film",
+    "rigidmd gallery heavy_top_3 intermediate_axis",
+    argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"),
+    argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),
+    argument("--force", action="store_true", help="replace an earlier gallery in that folder"),
+    scene="the gallery", writes=True,
+)  # fmt: skip
+def _gallery(options: Options) -> int:
+    from rigidmd.io.write import check_target
+    from rigidmd.view.run_page import INDEX, selected_bodies, write_gallery
+
+    folder = Path(options.output)
+    bodies = selected_bodies(options.names)
+    if folder.is_dir():
+        for name in (INDEX, *(f"{body.name}.html" for body in bodies)):
+            check_target(folder / name, (".html",), options.force)
+    command = shlex.join(["rigidmd", "gallery", *options.names])
+    print_page(write_gallery(folder, options.names, options.force, command, announce), [])
+    return 0
