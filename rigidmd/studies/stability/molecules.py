@@ -224,7 +224,7 @@ def far_away(result: CaseResult, quick: bool) -> None:
 def densities(result: CaseResult, quick: bool) -> None:
     """From vacuum to three times the density of a liquid: right, or refused because it cannot be packed."""
     for density in (1e-6, 1.0, 3.0) if quick else (1e-12, 1e-6, 1e-3, 0.3, 1.0, 1.5, 2.0, 2.5, 3.0):
-        cutoff = {"cutoff_A": 6.0 if density <= 1 else 4.2}
+        cutoff = {"cutoff_A": 6.0 if density <= 1 else 4.2, "electrostatics": "reaction_field"}
         waters, box = [{"model": "spce", "count": 64}], {"density_g_cm3": density}
         data = molecules_scene(waters, box, 0.25, 200, SPLIT, 298.0, None, cutoff)
         result.add(f"{density:g} g/cm³", run_molecules(data), 0.05, SPLIT, 0.25, RIGHT_OR_REFUSED)
