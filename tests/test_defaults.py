@@ -144,6 +144,7 @@ def test_a_tail_correction_is_for_boxes_that_molecules_fill(lattice, edges, expe
         {"box": {"lengths_A": [13.0, 13.0, 30.0]}, "fields": {"walls": [
             {"axis": "z", "positions_A": [0.0, 13.0], "kind": "harmonic", "stiffness_kJ_mol_A2": 100.0}]}},
         {"forces": {"cutoff_A": 6.0, "lennard_jones": False}},
+        {"forces": {"cutoff_A": 6.0, "custom": [{"name": "slow", "energy": "A/r", "parameters": {"A": 1.0}}]}},
     ],
 )  # fmt: skip
 def test_no_tail_correction_beside_walls_and_frozen_molecules(tables):

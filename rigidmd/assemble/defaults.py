@@ -123,11 +123,11 @@ def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tup
         like = forces.truncation in ("plain", "smooth_switch")
         numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
     if forces.tail_correction is None:
+        # a table ends at its cutoff, and a formula may fall too slowly for a correction
+        custom = forces.custom or scene.user_code.forces
         external = scene.engine.is_external and any(stage.has_barostat for stage in scene.stages)
-        applies = forces.lennard_jones and not (
-            external or scene.fields.walls or any(m.frozen for m in scene.molecules)
-        )
-        numbers["tail_correction"] = applies and is_homogeneous(composition)
+        other = custom or external or scene.fields.walls or any(m.frozen for m in scene.molecules)
+        numbers["tail_correction"] = forces.lennard_jones and not other and is_homogeneous(composition)
     return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), faults
 
 

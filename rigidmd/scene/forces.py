@@ -133,7 +133,8 @@ class Forces(Section):
     """Custom forces"""
     tail_correction: Flag | None = None
     """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not.
-    Default: true in a periodic box that the molecules fill evenly, false with walls, frozen molecules or empty space"""
+    Default: true in a periodic box that the molecules fill evenly; false with walls, frozen molecules, custom forces or
+    empty space"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
     """Coulomb forces: ewald and pme act on all periodic images, reaction_field and damped_shifted_force within the
     cutoff, coulomb on all pairs without a periodic box; none ignores charges. Default: pme in a periodic box, coulomb
