@@ -49,9 +49,10 @@ def pinned(tables: dict) -> dict:
     """Tables of a scene of molecules with a reaction field, one truncation for all forces, no tail correction and double
     precision, unless they say otherwise: one set of kernels for most tests. The defaults of users have tests of their
     own."""
-    forces = {"electrostatics": "reaction_field", "tail_correction": False} | tables.get("forces", {})
+    forces = {"electrostatics": "reaction_field", "tail_correction": False, "truncation": "switch"}
+    forces |= tables.get("forces", {})
     if forces["electrostatics"] == "reaction_field":
-        forces = {"reaction_field_truncation": forces.get("truncation", "switch")} | forces
+        forces = {"reaction_field_truncation": forces["truncation"]} | forces
     return {"precision": "double"} | tables | {"forces": forces}
 
 

@@ -107,11 +107,19 @@ def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
 
 
 def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of time steps that are too long for these molecules in a liquid: a step is unstable if a molecule at its
-    thermal speed moves or rotates in it by more than `stable_angle` amplitudes."""
-    warnings = []
+    """Warnings of time steps that are too long for these molecules in a liquid, and of orders that truncated forces do
+    not allow. A step is unstable if a molecule at its thermal speed moves or rotates in it by more than `stable_angle`
+    amplitudes."""
+    warnings, forces = [], scene.forces
+    ends = forces.cutoff_A is not None or scene.box.periodic
+    jumps = ends and forces.lennard_jones and forces.truncation in ("plain", "shift")
     species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
     for k, stage, temperature in _given_steps(scene):
+        if (order := stage.scheme.order) > 2 and jumps:
+            warnings.append(
+                f"stages.{k}: {stage.integrator} is of order {order}, which it loses where forces jump to 0 at the cutoff, "
+                f"as with forces.truncation = {scene.forces.truncation!r}. Use truncation = 'smooth_switch'"
+            )
         if (fastest := fastest_motion(species, temperature)) is None or not scene.watch.stable_step:
             continue
         time, size, unit, name, does = fastest
@@ -156,9 +164,12 @@ def with_precision(
     elif errors:
         k = min(errors, key=lambda k: errors[k])
         precision, stage = precision_for(errors[k]), scene.stages[k]
+        step, ratio = f"{stage.integrator} at {stage.timestep_fs:g} fs", errors[k] / MIXED_ERROR
         why = (
-            f"the error of {stage.integrator} at {stage.timestep_fs:g} fs, about {errors[k]:.0e} of the forces, is "
-            f"{errors[k] / MIXED_ERROR:,.0f} times that of single precision, {MIXED_ERROR:.0e}"
+            f"the error of {step}, about {errors[k]:.0e} of the forces, is {f'{ratio:,.0f}' if ratio > 9 else f'{ratio:.1g}'} "
+            f"times that of single precision, {MIXED_ERROR:.0e}"
             f"{'' if precision == 'mixed' else f', and not {MARGIN} times'}"
         )
+        if ratio == inf:
+            why = f"{step} is unstable for motions of these molecules, which hides the error of single precision"
     return scene.model_copy(update={"precision": precision}), why

@@ -117,9 +117,9 @@ class Forces(Section):
 
     cutoff_A: Positive | None = None
     """Cutoff between sites; default: 9 Å in a periodic box, none without a box"""
-    truncation: Truncation = "switch"
-    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of high order. Charges follow
-    reaction_field_truncation and ewald_truncation"""
+    truncation: Truncation = "shift"
+    """Cutoff scheme of Lennard-Jones forces; smooth_switch suits integrators of order 4 and more, which forces that
+    jump at the cutoff bring down. Charges follow reaction_field_truncation and ewald_truncation"""
     switch_start_A: Positive | None = None
     """Where force_switch and switch begin; default: 1 Å before the cutoff, or at 0.9 of it if that is larger. Where
     smooth_switch begins; default: at 0.6 of the cutoff"""
@@ -177,7 +177,7 @@ class Forces(Section):
 
     def _errors(self):
         if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
-            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}"
+            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}; give truncation = 'switch' too"
         yield from self.idle_keys(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
