@@ -117,7 +117,7 @@ def step_warnings(scene: MolecularScene) -> list[str]:
     for k, stage, temperature in _given_steps(scene):
         if (order := stage.scheme.order) > 2 and jumps:
             warnings.append(
-                f"stages.{k}: {stage.integrator} is of order {order}, which it loses where forces jump to 0 at the cutoff, "
+                f"stages.{k}: {stage.integrator} is of order {order}, lost where forces jump to 0 at the cutoff, "
                 f"as with forces.truncation = {scene.forces.truncation!r}. Use truncation = 'smooth_switch'"
             )
         if (fastest := fastest_motion(species, temperature)) is None or not scene.watch.stable_step:
@@ -165,9 +165,10 @@ def with_precision(
         k = min(errors, key=lambda k: errors[k])
         precision, stage = precision_for(errors[k]), scene.stages[k]
         step, ratio = f"{stage.integrator} at {stage.timestep_fs:g} fs", errors[k] / MIXED_ERROR
+        times = f"{ratio:,.0f}" if ratio > 9 else f"{ratio:.1g}"
         why = (
-            f"the error of {step}, about {errors[k]:.0e} of the forces, is {f'{ratio:,.0f}' if ratio > 9 else f'{ratio:.1g}'} "
-            f"times that of single precision, {MIXED_ERROR:.0e}"
+            f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times "
+            f"that of single precision, {MIXED_ERROR:.0e}"
             f"{'' if precision == 'mixed' else f', and not {MARGIN} times'}"
         )
         if ratio == inf:

@@ -177,7 +177,7 @@ class Forces(Section):
 
     def _errors(self):
         if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
-            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}; give truncation = 'switch' too"
+            yield f"switch_start_A would do nothing with truncation = {self.truncation!r}: add truncation = 'switch'"
         yield from self.idle_keys(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
