@@ -33,8 +33,8 @@ from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 
 README = ROOT / "README.md"
-DOCUMENTS = [README, *(ROOT / "rigidmd" / "docs" / f"{name}.md" for name in CHAPTERS)]
-MANUAL = (ROOT / "rigidmd" / "docs" / "manual.md").read_text(encoding="utf-8")
+DOCUMENTS = [README, *CHAPTERS.values()]
+MANUAL = "\n".join(path.read_text(encoding="utf-8") for path in CHAPTERS.values() if path.parent.name == "reference")
 LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
 MINIMAL = {
     MolecularScene: {
@@ -353,7 +353,7 @@ def test_readme_is_a_first_page_and_leads_to_every_chapter():
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 130
     for name in CHAPTERS:
-        assert f"(rigidmd/docs/{name}.md)" in text
+        assert f"({CHAPTERS[name].relative_to(ROOT)})" in text
 
 
 def test_author_and_version_are_the_same_wherever_they_are_said():
@@ -364,15 +364,15 @@ def test_author_and_version_are_the_same_wherever_they_are_said():
     assert f"{{{{{author['name']}}}}}" in text
     assert f"version {version}," in text
     assert f"version = {{{version}}}" in text
-    assert f"\n## {version}" in (DOCS / "changelog.md").read_text(encoding="utf-8")
+    assert f"\n## {version}" in CHAPTERS["changelog"].read_text(encoding="utf-8")
 
 
 def test_help_lists_and_prints_the_chapters(capsys):
-    assert {path.stem for path in DOCS.glob("*.md")} == set(CHAPTERS)
+    assert set(DOCS.rglob("*.md")) == set(CHAPTERS.values())
     assert cli.main(["help"]) == 0
     listed = capsys.readouterr().out
     for name in CHAPTERS:
-        source = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+        source = CHAPTERS[name].read_text(encoding="utf-8")
         about = source.splitlines()[2]
         assert about.endswith(".")
         assert len(about) <= 120
@@ -383,18 +383,18 @@ def test_help_lists_and_prints_the_chapters(capsys):
         assert "<!--" not in said
         assert "![" not in said
         with contextlib.suppress(StopIteration):
-            code = next(block for block in blocks_of(DOCS / f"{name}.md") if block.language == "sh")
+            code = next(block for block in blocks_of(CHAPTERS[name]) if block.language == "sh")
             assert re.sub(r"systems/(?=\w+\.toml)", "", code.text) in said
         for stem, ending in re.findall(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source):
             assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
         assert not re.search(r"systems/(scripts/)?\w+\.(toml|py)", said)
     cli.main(["help", "top"])
-    picture = "tests/benchmarks/results/seven_tops.png"  # a wheel does not have it
-    where = f", {picture}" if (DOCS.parent.parent / picture).is_file() else ""
-    assert f"[picture: seven heavy tops{where}]" in capsys.readouterr().out
+    assert f"[picture: seven heavy tops, {DOCS / 'images' / 'seven_tops.png'}]" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("name", "expected"), [("manuel", "did you mean manual?"), ("qqq", "there are top, water")])
+@pytest.mark.parametrize(
+    ("name", "expected"), [("commandes", "did you mean commands?"), ("qqq", "there are top, water")]
+)
 def test_a_chapter_that_is_not_there(name, expected, capsys):
     assert cli.main(["help", name]) == 2
     assert expected in capsys.readouterr().err

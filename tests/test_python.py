@@ -240,7 +240,7 @@ def pyright(project):
 def findings_in_script(folder, text):
     """What pyright says of a script, the tutorial and the chapter about it: (severity, line, message) of each finding."""
     cells = json.loads((ROOT / "systems" / "notebooks" / "tutorial.ipynb").read_text())["cells"]
-    chapter = (ROOT / "rigidmd" / "docs" / "notebook.md").read_text()
+    chapter = (ROOT / "rigidmd" / "docs" / "tutorials" / "notebook.md").read_text()
     files = {
         "script.py": text,
         "tutorial.py": "\n".join("".join(part["source"]) for part in cells if part["cell_type"] == "code"),

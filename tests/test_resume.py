@@ -890,7 +890,7 @@ def test_a_failed_write_stops_the_run(stopped, tmp_path):
 @pytest.mark.soak
 def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     """The recipe of the manual, with a scheduler that starts the next job at once."""
-    manual = (ROOT / "rigidmd" / "docs" / "manual.md").read_text()
+    manual = (ROOT / "rigidmd" / "docs" / "guides" / "resume.md").read_text()
     job = next(block for block in re.findall(r"```text\n(.*?)```", manual, re.DOTALL) if "#SBATCH" in block)
     (tmp_path / "job.sh").write_text(job.replace("3:55:00", "0:00:05"))
     (tmp_path / "bin").mkdir()

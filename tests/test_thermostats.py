@@ -330,6 +330,6 @@ def test_adding_a_thermostat_or_barostat_takes_two_files(kinds, physics):
         if where not in allowed and not where.startswith("engines/"):
             text = path.read_text(encoding="utf-8")
             assert not [name for name in kinds if f'"{name}"' in text and name != "langevin"], where
-    documents = (package / "docs" / "ensembles.md").read_text(encoding="utf-8")
+    documents = (package / "docs" / "guides" / "ensembles.md").read_text(encoding="utf-8")
     for name, kind in kinds.items():
         assert f'`"{name}"`' in documents and kind.source.split(",")[0].split(" 20")[0].split(" 19")[0] in documents

@@ -171,7 +171,7 @@ def found_in(path, comments=False):
             yield f"{path.relative_to(ROOT)}:{line + text[:at].count(chr(10))}: {word!r}: write {better}"
 
 
-FILES = sorted([*PACKAGE.rglob("*.py"), *(PACKAGE / "docs").glob("*.md"), ROOT / "README.md"])
+FILES = sorted([*PACKAGE.rglob("*.py"), *(PACKAGE / "docs").rglob("*.md"), ROOT / "README.md"])
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())

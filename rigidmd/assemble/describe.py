@@ -26,7 +26,7 @@ from rigidmd.scene.molecules import name_of
 from rigidmd.scene.validation import not_none
 from rigidmd.units import BAR, KJ_PER_MOL
 
-#: Precision of forces, for reports. Times: docs/benchmarks.md.
+#: Precision of forces, for reports. Times: docs/evidence/benchmarks.md.
 PRECISIONS = {
     "double": f'double precision (precision = "mixed" takes half the time; forces have errors of {MIXED_ERROR:.0e})',
     "mixed": f"mixed precision: single between sites, with errors of forces of {MIXED_ERROR:.0e}, else double",

@@ -13,9 +13,9 @@ def _help(options: Options) -> int:
     if options.chapter is not None:
         print(chapter_text(options.chapter))
         return 0
-    found = contents()
-    width = max(map(len, found))
     print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
-    for name, about in found.items():
-        print(f"  {name:<{width}}  {about}")
+    for folder, found in contents().items():
+        print(f"\n{folder}")
+        for name, about in found.items():
+            print(f"  {name:<14}  {about}")
     return 0

@@ -36,5 +36,5 @@ def _new(options: Options) -> int:
         return 0
     print(f"  rigidmd check {quoted}    describes the run without running it")
     print(f"  rigidmd run {quoted}      runs it; results go to {Path('runs') / path.stem}")
-    print("its comment describes what to look at; `rigidmd help manual` explains every table")
+    print("its comment describes what to look at; `rigidmd help scene` explains every table")
     return 0

@@ -22,11 +22,18 @@ NOTEBOOKS, SCRIPTS = "notebooks/*.ipynb", "scripts/*.py"
 _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.py)")
 #: Kind of an example by the extension of its file.
 KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
-#: In the order of the list.
-CHAPTERS = (
-    "top", "water", "molecule", "ensembles", "looking", "notebook", "measuring", "studies", "ase", "engines",
-    "extending", "architecture", "manual", "benchmarks", "validation", "changelog",
-)  # fmt: skip
+#: Folders of the documentation and their chapters, in the order of the list.
+SECTIONS = {
+    "tutorials": ("top", "water", "molecule", "notebook"),
+    "guides": (
+        "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
+        "engines", "extending",
+    ),
+    "reference": ("commands", "scene", "body", "files", "integrators", "python"),
+    "evidence": ("benchmarks", "validation"),
+    "project": ("architecture", "changelog"),
+}  # fmt: skip
+CHAPTERS = {name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names}
 
 
 class Example(NamedTuple):
@@ -97,9 +104,12 @@ def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path]
     return [path, *inputs]
 
 
-def contents() -> dict[str, str]:
-    """Chapters of the documentation: name -> subject, the first line under its title."""
-    return {name: (DOCS / f"{name}.md").read_text(encoding="utf-8").splitlines()[2] for name in CHAPTERS}
+def contents() -> dict[str, dict[str, str]]:
+    """Chapters of the documentation by folder: name -> subject, the first line under its title."""
+    return {
+        folder: {name: CHAPTERS[name].read_text(encoding="utf-8").splitlines()[2] for name in names}
+        for folder, names in SECTIONS.items()
+    }
 
 
 def chapter_text(name: str) -> str:
@@ -116,7 +126,7 @@ def chapter_text(name: str) -> str:
 
 def _plain(name: str) -> str:
     """The text of a chapter. Shipped files are named as `rigidmd new` copies them, not by their paths."""
-    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    text = CHAPTERS[name].read_text(encoding="utf-8")
     text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
     copied = sorted(set(_SHIPPED.findall(text)))
     title, _, text = text.partition("\n")
@@ -125,8 +135,8 @@ def _plain(name: str) -> str:
         title += f"\n\n`rigidmd new NAME` copies the shipped files that are named here:\n{files}"
 
     def picture(found: re.Match) -> str:
-        about, up, path = found.groups()
-        return f"[picture: {about}{f', {path}' if (DOCS / up / path).is_file() else ''}]"
+        about, path = found.groups()
+        return f"[picture: {about}, {(CHAPTERS[name].parent / path).resolve()}]"
 
-    text = re.sub(r"!\[([^\]]*)\]\(((?:\.\./)*)([^)]*)\)", picture, _SHIPPED.sub(r"\1\2", text))
+    text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", picture, _SHIPPED.sub(r"\1\2", text))
     return f"{title}\n{text}".rstrip()

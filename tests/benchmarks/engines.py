@@ -1,4 +1,4 @@
-"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for docs/validation.md.
+"""The ten scenes of tests/scenes.py on rigidmd and another engine, a line each: for docs/evidence/validation.md.
 
 python tests/benchmarks/engines.py [lammps|openmm]
 """

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/figures.py
 
-writes results/water_energy.png (the run's own energy.png) and results/water_box.png beside this file.
+writes water_energy.png (energy.png of the run) and water_box.png in rigidmd/docs/images.
 """
 
 import shutil
@@ -61,15 +61,15 @@ def draw_box(path: Path, positions: np.ndarray, elements, edges: np.ndarray) -> 
 
 def main() -> None:
     """Run and draw."""
-    results = HERE / "results"
+    images = HERE.parents[1] / "rigidmd" / "docs" / "images"
     with tempfile.TemporaryDirectory() as folder:
         scene = Scene.read(HERE.parent.parent / "systems" / "water.toml", {"output.positions": "wrapped"})
         run = Simulation(scene, Path(folder) / "water").run()
-        shutil.copyfile(Path(folder) / "water" / "energy.png", results / "water_energy.png")
+        shutil.copyfile(Path(folder) / "water" / "energy.png", images / "water_energy.png")
         universe = run.universe()
         universe.trajectory[-1]
         elements = [name[0] for name in universe.atoms.names]
-        draw_box(results / "water_box.png", universe.atoms.positions, elements, universe.dimensions[:3])
+        draw_box(images / "water_box.png", universe.atoms.positions, elements, universe.dimensions[:3])
 
 
 if __name__ == "__main__":

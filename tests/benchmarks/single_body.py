@@ -2,7 +2,7 @@
 
     python tests/benchmarks/single_body.py
 
-writes results/single_body.csv and results/single_body.png and prints the table of the benchmarks. The top is that of
+writes single_body.csv and single_body.png of the documentation and prints the table of the benchmarks. The top is that of
 systems/heavy_top_3.toml for 20 nutations; the error is that of Q at the end against the elliptic solution. SciPy solves
 the 12-variable system (direction cosines and angular velocity) once with a right-hand side in plain Python as a user
 would write it, once through this engine (integrator = "dop853"). Medians of five; one thread.
@@ -26,7 +26,7 @@ from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 ROOT = Path(__file__).parents[2]
-RESULTS = Path(__file__).parent / "results"
+DOCS = Path(__file__).parents[2] / "rigidmd" / "docs"
 NUTATIONS, REPEATS = 20, 5
 STEPS = {  # a nutation
     "velocity_verlet": (60, 100, 300, 1000, 3000, 10000, 30000, 100000),
@@ -90,7 +90,7 @@ def main():
                 seconds[name, setting].append(spent)
             errors[name, setting] = float(np.abs(rotation - exact).max())
     rows = [(name, setting, median(seconds[name, setting]), errors[name, setting]) for name, setting, _ in cases]
-    with (RESULTS / "single_body.csv").open("w", newline="") as file:
+    with (DOCS / "evidence" / "data" / "single_body.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["method", "steps a nutation or tolerance", "seconds", "error of Q at the end"])
         writer.writerows(rows)
@@ -163,7 +163,7 @@ def draw(rows):
     axis.set_title("a heavy top: error against run time", loc="left", fontsize=11)
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.4, 0.0))
-    figure.savefig(RESULTS / "single_body.png", dpi=150)
+    figure.savefig(DOCS / "images" / "single_body.png", dpi=150)
 
 
 if __name__ == "__main__":

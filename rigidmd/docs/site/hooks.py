@@ -1,0 +1,89 @@
+"""Hooks of MkDocs for the site: pages made from other files, live pages, and equations."""
+
+import html
+import re
+import subprocess
+import sys
+import tempfile
+from importlib import import_module
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File
+
+from rigidmd.core.shipped import DOCS, SECTIONS
+
+README = DOCS.parents[1] / "README.md"
+#: Live pages: scene, options of the run.
+LIVE = {
+    "heavy_top_3": (), "intermediate_axis": (), "water": ("--set", "output.trajectory_interval_ps=0.5"),
+}  # fmt: skip
+API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
+CSS = """.md-typeset math { font-size: 1.08em; }
+.md-typeset div.arithmatex { overflow-x: auto; overflow-y: hidden; padding: .3em 0; }
+.md-typeset table:not([class]) td, .md-typeset table:not([class]) th { padding: .5em .8em; min-width: 0; }
+"""
+
+
+def on_config(config):
+    config.nav = [
+        {"Home": ["index.md"]},
+        *({folder.capitalize(): [f"{folder}/{name}.md" for name in names]} for folder, names in SECTIONS.items()),
+    ]
+    next(group["Reference"] for group in config.nav if "Reference" in group).append("reference/api.md")
+    return config
+
+
+def on_files(files, config):
+    front = README.read_text(encoding="utf-8").replace("rigidmd/docs/", "")
+    files.append(File.generated(config, "index.md", content=front))
+    files.append(File.generated(config, "reference/api.md", content=_api()))
+    files.append(File.generated(config, "site.css", content=CSS))
+    for name in LIVE:
+        files.append(File.generated(config, f"live/{name}.html", abs_src_path=str(_live_page(name))))
+    return files
+
+
+def _api() -> str:
+    """A page with every public name of the Python interface."""
+    lines = ["# Python interface", "", "Every public class and function, from the docstrings of the package.", ""]
+    for module in map(import_module, API):
+        lines += [f"## {module.__name__}", "", (module.__doc__ or "").partition("\n")[0], ""]
+        for name in sorted(getattr(module, "__all__", ())):
+            member = getattr(module, name)
+            if callable(member):
+                lines += [f"::: {member.__module__}.{member.__qualname__}", ""]
+    return "\n".join(lines)
+
+
+def _live_page(name: str) -> Path:
+    """The page that `rigidmd view` writes of a run of a shipped scene."""
+    folder = Path(tempfile.mkdtemp())
+    for command in (("run", f"{name}.toml", "-o", "run", *LIVE[name]), ("view", "run")):
+        if command[0] == "run":
+            subprocess.run([sys.executable, "-m", "rigidmd", "new", name], cwd=folder, check=True)
+        subprocess.run([sys.executable, "-m", "rigidmd", *command], cwd=folder, check=True)
+    return next((folder / "run").glob("*.html"))
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Links to files that are not part of the documentation become text."""
+
+    def link(found: re.Match) -> str:
+        text, target = found.groups()
+        path = (DOCS / page.file.src_uri).parent / target.partition("#")[0]
+        inside = not target or "://" in target or path.resolve().is_relative_to(DOCS)
+        return found[0] if inside or target.startswith("#") else text
+
+    return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, markdown)
+
+
+def on_page_content(content, page, config, files):
+    """Equations in TeX become MathML."""
+
+    def equation(found: re.Match) -> str:
+        tag, opening, tex = found[1], found[2], html.unescape(found[3])
+        display = "block" if opening == r"\[" else "inline"
+        return f'<{tag} class="arithmatex">{convert(tex.strip(), display=display)}</{tag}>'
+
+    return re.sub(r'<(span|div) class="arithmatex">(\\[\[(])(.*?)\\[\])]</\1>', equation, content, flags=re.DOTALL)
