@@ -42,7 +42,7 @@ LIBRARIES = {
     "tomli_w": {"io/scene_file.py"},
 }  # fmt: skip
 
-FILES = sorted(PACKAGE.rglob("*.py"))
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if "docs" not in path.parts)  # docs: hooks of the site
 
 
 def name_of(path):

@@ -442,6 +442,8 @@ lengths_A = 20.0
 [[molecules]]
 model = "argon"
 count = 20
+[forces]
+truncation = "smooth_switch"
 [start]
 temperature_K = 90
 [[stages]]
