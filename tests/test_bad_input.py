@@ -85,7 +85,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("[start]\ntemperature_K = 300", "", ["start.temperature_K is missing"]),
         ("[start]", "[forces]\nskin_A = 0\n[start]", ["forces.skin_A"]),
         ("[start]", '[forces]\ntruncation = "swich"\n[start]', ["forces.truncation", "did you mean switch?"]),
-        ("[start]", "[forces]\ncutoff_A = 6\nswitch_start_A = 7\n[start]", ["switch_start_A = 7", "below"]),
+        ("[start]", '[forces]\ntruncation = "switch"\ncutoff_A = 6\nswitch_start_A = 7\n[start]', ["switch_start_A = 7", "below"]),
         ("[start]", '[output]\ntrajectory = "../t.xtc"\n[start]', ["output.trajectory", "plain file name"]),
         ("[start]", '[output]\ntrajectory = "t.mp4"\n[start]', ["output.trajectory", ".xtc"]),
         ("[start]", "[output]\nvelocities = true\n[start]", ["trajectory.xtc cannot store them", "use a .gsd or .nc or .traj or .trr file"]),

@@ -15,10 +15,8 @@ from support import (
     coulomb_errors,
     describe,
     error_of_step,
-    pinned,
     pme_error,
     real_error,
-    small_scene,
     stable_angle,
     step_error,
 )  # fmt: skip
@@ -93,7 +91,7 @@ def test_without_a_box_all_pairs_of_charges_act_whatever_the_cutoff():
 )  # fmt: skip
 def test_a_reaction_field_is_truncated_apart_from_lennard_jones(forces, expected):
     found = forces_of(forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"} | forces)
-    assert (found.reaction_field_truncation, found.truncation) == (expected, forces.get("truncation", "switch"))
+    assert (found.reaction_field_truncation, found.truncation) == (expected, forces.get("truncation", "shift"))
 
 
 def test_the_force_of_a_conducting_reaction_field_vanishes_at_the_cutoff():
@@ -273,11 +271,3 @@ def test_the_error_of_velocity_verlet_is_known():
     species = build(scene()).species
     assert error_of_step(species, 0.0, SCHEMES["velocity_verlet"], 2.0) == 0.0
     assert error_of_step(species, 298.15, SCHEMES["velocity_verlet"], 2.0) > 100 * MARGIN * MIXED_ERROR
-
-
-def test_pinned_scenes_are_not_the_defaults():
-    found = build(small_scene({"spce": 64}, 13.0, forces={"cutoff_A": 6.0})).scene
-    assert (found.forces.electrostatics, found.precision, found.forces.tail_correction) == (
-        "reaction_field", "double", False,
-    )  # fmt: skip
-    assert pinned({})["forces"]["reaction_field_truncation"] == "switch"

@@ -431,7 +431,7 @@ def test_parameters_may_come_from_the_model():
         forces={"custom": [{"name": "wall", "energy": "k/r**9"}]},
     )
     assert build(scene).terms["wall"].potential.parameters[0, 0, 0] == pytest.approx(300)
-    assert "wall: k/r**9, 10 sites, cutoff 9 Å, switch" in describe(scene)
+    assert "wall: k/r**9, 10 sites, cutoff 9 Å, shift" in describe(scene)
 
 
 # --- tables in files -------------------------------------------------------------------------------------------------

@@ -173,4 +173,6 @@ def with_precision(
         )
         if ratio == inf:
             why = f"{step} is unstable for motions of these molecules, which hides the error of single precision"
+        elif ratio == 0:
+            why = "the fastest motion of these molecules is not known"
     return scene.model_copy(update={"precision": precision}), why

@@ -1,11 +1,13 @@
 """Hooks of MkDocs for the site: pages made from other files, live pages, and equations."""
 
 import html
+import inspect
 import re
 import subprocess
 import sys
 import tempfile
 from importlib import import_module
+from os.path import normpath
 from pathlib import Path
 
 from latex2mathml.converter import convert
@@ -16,11 +18,13 @@ from rigidmd.core.shipped import DOCS, SECTIONS
 README = DOCS.parents[1] / "README.md"
 #: Live pages: scene, options of the run.
 LIVE = {
-    "heavy_top_3": (), "intermediate_axis": (), "water": ("--set", "output.trajectory_interval_ps=0.5"),
+    "heavy_top_3": (), "intermediate_axis": (), "dry_ice": ("--set", "output.trajectory_interval_ps=0.1"),
+    "water": ("--set", "output.trajectory_interval_ps=0.5"),
 }  # fmt: skip
 API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
 CSS = """.md-typeset math { font-size: 1.08em; }
 .md-typeset div.arithmatex { overflow-x: auto; overflow-y: hidden; padding: .3em 0; }
+.md-typeset .docstring { white-space: pre-line; }
 .md-typeset table:not([class]) td, .md-typeset table:not([class]) th { padding: .5em .8em; min-width: 0; }
 """
 
@@ -36,6 +40,8 @@ def on_config(config):
 
 def on_files(files, config):
     front = README.read_text(encoding="utf-8").replace("rigidmd/docs/", "")
+    live = [f"[{name}](live/{name}.html)" for name in LIVE]
+    front += f"\n## Live pages\n\nPages that `rigidmd view` wrote of shipped scenes: {', '.join(live)}.\n"
     files.append(File.generated(config, "index.md", content=front))
     files.append(File.generated(config, "reference/api.md", content=_api()))
     files.append(File.generated(config, "site.css", content=CSS))
@@ -49,11 +55,37 @@ def _api() -> str:
     lines = ["# Python interface", "", "Every public class and function, from the docstrings of the package.", ""]
     for module in map(import_module, API):
         lines += [f"## {module.__name__}", "", (module.__doc__ or "").partition("\n")[0], ""]
-        for name in sorted(getattr(module, "__all__", ())):
-            member = getattr(module, name)
-            if callable(member):
-                lines += [f"::: {member.__module__}.{member.__qualname__}", ""]
+        for name, member in ((name, getattr(module, name)) for name in sorted(getattr(module, "__all__", ()))):
+            if not callable(member):
+                continue
+            lines += [*_entry("###", name, member), ""]
+            methods = vars(member).items() if inspect.isclass(member) and not issubclass(member, Exception) else ()
+            for method, found in methods:
+                if not method.startswith("_") and (callable(found) or isinstance(found, property)):
+                    lines += [*_entry("####", f"{name}.{method}", found), ""]
     return "\n".join(lines)
+
+
+def _entry(rank: str, name: str, member: object) -> list[str]:
+    """Heading, signature and docstring of a class, function or property."""
+    function = getattr(member, "__func__", member)
+    try:
+        signature = "" if isinstance(member, property) else str(inspect.signature(function))
+    except ValueError:
+        signature = "(...)"
+    kind = "class " if inspect.isclass(member) else ""
+    text = html.escape(inspect.getdoc(member) or "")
+    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
+    signature = re.sub(r"rigidmd\.(?:\w+\.)*|'", "", signature)
+    return [
+        f"{rank} {name}",
+        "",
+        "```python",
+        f"{kind}{name}{signature}",
+        "```",
+        "",
+        f'<div class="docstring">{text}</div>',
+    ]
 
 
 def _live_page(name: str) -> Path:
@@ -71,9 +103,8 @@ def on_page_markdown(markdown, page, config, files):
 
     def link(found: re.Match) -> str:
         text, target = found.groups()
-        path = (DOCS / page.file.src_uri).parent / target.partition("#")[0]
-        inside = not target or "://" in target or path.resolve().is_relative_to(DOCS)
-        return found[0] if inside or target.startswith("#") else text
+        path = normpath(Path(page.file.src_uri).parent / target.partition("#")[0])
+        return found[0] if re.match(r"#|https?:", target) or files.get_file_from_path(path) else text
 
     return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, markdown)
 
