@@ -61,7 +61,7 @@ def _api() -> str:
             lines += [*_entry("###", name, member), ""]
             methods = vars(member).items() if inspect.isclass(member) and not issubclass(member, Exception) else ()
             for method, found in methods:
-                if not method.startswith("_") and (callable(found) or isinstance(found, property)):
+                if not method.startswith(("_", "model_")) and (callable(found) or isinstance(found, property)):
                     lines += [*_entry("####", f"{name}.{method}", found), ""]
     return "\n".join(lines)
 
