@@ -26,7 +26,7 @@ KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
 SECTIONS = {
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
-        "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
+        "npt", "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
         "engines", "extending",
     ),
     "reference": ("commands", "scene", "body", "files", "integrators", "python"),
