@@ -29,6 +29,7 @@ SECTIONS = {
         "npt", "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
         "engines", "extending",
     ),
+    "theory": ("interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "files", "integrators", "python"),
     "evidence": ("benchmarks", "validation"),
     "project": ("architecture", "changelog"),

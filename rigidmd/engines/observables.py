@@ -66,10 +66,8 @@ def observe(
     stage : index of the stage, which may remove momentum from the degrees of freedom of the temperatures
     time : ps, by default of the state
     origin : conserved energy at the start of the stage, from which its drift is counted; by default the present one
-    verlet_step : time step (ps) if the state comes from velocity Verlet. Between its kicks the kinetic energy is higher
-    than at its steps by dt²/8 [sum F²/m + sum n . I^-1 n] on average: for a mode of frequency w the first is too high
-    by x/12 and the second too low by x/6, x = (w dt)². The weighted mean (twice the first plus once the second)/3 is
-    right to O(x²) (Eastwood et al. 2010, J. Chem. Theory Comput. 6, 2045): the unbiased temperatures.
+    verlet_step : time step (ps) if the state comes from velocity Verlet, for unbiased temperatures
+    (docs/theory/errors.md)
     moved : whether the engine has just moved this state, so that it may have its forces and energies already
     energy_unit : unit of all energies, u Å²/ps²
 

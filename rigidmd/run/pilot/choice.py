@@ -31,13 +31,8 @@ JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 class EnergyWalk(NamedTuple):
     """The random walk of the energy that truncated forces cause, for any integrator and step.
 
-    The kicks of a step are a quadrature, with weights b_i at the times c_i dt, of force times velocity. Where a pair
-    crosses a distance at which the k-th derivative of its force jumps, at a random time s dt of a step, they miss the
-    integral by
-
-        dE ~ dt^(k+1) sum_i b_i B_(k+1)({c_i - s})/(k+1)!        (Euler-Maclaurin; B: Bernoulli polynomials)
-
-    whose mean over s is 0. So the variance of the energy grows as D t, by the Fourier series of B,
+    Where pairs cross a distance at which the k-th derivative of their force jumps, the variance of the energy grows as
+    D t (docs/theory/errors.md), with the kicks b_i at the times c_i dt:
 
         D = scale w dt^(2k+2),    w = sum_n |sum_i b_i exp(2 pi i n c_i)|² / n^(2k+2)
 
@@ -45,8 +40,6 @@ class EnergyWalk(NamedTuple):
     precision of the forces acts as k = -1/2. In 27 SPC/E waters D of srkn_4 at 8, 4 and 2 fs was 2e-7, 1.7e-9 and
     2.3e-11 kT²/ps per degree of freedom with `switch`; D of srkn_4 over D of srkn_6 at 4 fs was 34 with `switch` (here
     41) and 970 with `smooth_switch` (885).
-
-    A step conserves phase-space volume, so <exp(-dE/kT)> = 1 and the walk has the mean <dE> = <dE²>/2kT.
 
     D is in squares of the energy unit of a `TrialSystem` per unit of time of its span.
     """

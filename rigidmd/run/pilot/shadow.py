@@ -1,22 +1,7 @@
 """The bias of averages by the time step, from the shadow Hamiltonian; by it "auto" chooses a step for bias_kT.
 
-A symplectic step conserves a shadow Hamiltonian. For kick, drift, kick it is, to O(dt²),
-
-    H' = H + dt² (p.M⁻¹ U" M⁻¹ p/12 - F.M⁻¹ F/24)
-
-(Leimkuhler & Matthews 2015, Molecular Dynamics, chapters 3 and 7), and the same with torques and moments of inertia.
-The motions of a liquid come into equilibrium with one another in H', at a temperature T' that the thermostat sets. With
-W = <F.M⁻¹ F>/kT = <tr M⁻¹ U">, the sum of w² over f degrees of freedom, exp(-H'/kT') expanded about exp(-H/kT) gives
-
-    <p.M⁻¹ p> = kT' (f - dt² W/6)                            at the ends of steps
-    <U> - <U>_exact = dt² W kT (1 - a)/24 + C (T' - T),      a = d ln W/d ln T, C = d<U>/dT
-
-A thermostat at the ends of steps controls the kinetic energy there: T'/T = 1 + dt² W/(6 f). In the middle of a drift
-it is higher by dt² W kT/8. BAOAB, which controls the latter, has T'/T = 1 - dt² W/(12 f).
-
-Harmonic motions have a = 0 and C = f k/2. With x = dt² W/f, the mean of (w dt)², the bias of U per degree of freedom is
-then (x/24 + x/12) kT = x/8 kT for velocity Verlet, and (x/24 - x/24) kT = 0 for BAOAB: its harmonic
-oscillators have no bias at any step. In a liquid the parts do not cancel, and the bias is taken to be one of them.
+docs/theory/errors.md derives the formulas. In a liquid the two parts of the bias of BAOAB do not cancel, and it is
+taken to be one of them.
 """
 
 from dataclasses import replace
