@@ -16,7 +16,14 @@ from rigidmd.dynamics.model import mobile
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.direct_sum import EwaldSum
-from rigidmd.forces.ewald.errors import charges_in, k_cutoff_of_count, k_space_error, pme_error, real_error
+from rigidmd.forces.ewald.errors import (
+    charges_in,
+    filled_fraction,
+    k_cutoff_of_count,
+    k_space_error,
+    pme_error,
+    real_error,
+)
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
@@ -69,7 +76,8 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     else:
         term = cast("Pme", term)
         reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
-    return float(np.hypot(real_error(charges, term.alpha, cutoff, volume), reciprocal)) * COULOMB
+    filled = filled_fraction(system.species, counts, volume)
+    return float(np.hypot(real_error(charges, term.alpha, cutoff, volume), reciprocal)) / np.sqrt(filled) * COULOMB
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:

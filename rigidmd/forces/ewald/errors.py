@@ -18,7 +18,7 @@ MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
 #: grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å and accuracies of 1e-4 to 1e-5.
 SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.0
 ORDERS = (4, 5, 6, 7, 8)
-SPACINGS = 3.0 * 0.98 ** np.arange(150)  # Å, from which grids are chosen
+SPACINGS = 3.0 * 0.98 ** np.arange(-250, 150)  # Å, from which grids are chosen
 MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
 #: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those in bins of COARSE Å.
 FINE, COARSE, MANY_CHARGES = 6, 0.1, 200
@@ -71,6 +71,15 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
     most = real_error(charges, 0.0, cutoff, volume)
     # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
+
+
+def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> float:
+    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1. In a dilute box the error
+    of forces is that of such a cluster, not that of the mean density."""
+    filled = 0.0
+    for m, n in zip(species, map(int, counts), strict=True):
+        filled += n * (2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma)) ** 3
+    return min(1.0, filled / volume) or 1.0
 
 
 def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
@@ -196,15 +205,17 @@ def _fastest_grid(
     return cheapest, best
 
 
-def fastest_cutoff(charges: Charges, cell: np.ndarray, longest: float, error: float) -> float | None:
+def fastest_cutoff(
+    charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
+) -> float | None:  # fmt: skip
     """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and reciprocal space each have
     this error; None if no cutoff reaches it. It follows from numbers of operations, not from a clock: the same scene
-    has the same cutoff everywhere."""
+    has the same cutoff everywhere. filled : see `filled_fraction`; molecules may gather in this part of the volume"""
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
 
     @cache
     def cost(k: int) -> float:
-        pairs = charges.count**2 / (2 * volume) * 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3
+        pairs = charges.count**2 / 2 * min(1.0, 4 / 3 * pi * (cutoffs[k] + LIST_MARGIN) ** 3 / (filled * volume))
         alpha = alpha_for(charges, cutoffs[k], volume, error)
         return PAIR_NS * pairs + _fastest_grid(charges, alpha, cell, error)[0]
 

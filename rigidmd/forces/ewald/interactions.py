@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, fastest_cutoff, k_cutoff_for, k_cutoff_of_count,
-    k_space_error, pme_error, pme_grid_for, real_error,
+    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, fastest_cutoff, filled_fraction, k_cutoff_for,
+    k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
@@ -20,7 +20,8 @@ from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
 #: Default of forces.ewald_accuracy: for SPC/E at 9 Å GROMACS' defaults have 9e-5 and OpenMM's 8e-5 by `errors`.
 ACCURACY = 5e-5
-#: Longest real-space cutoff that PME chooses, Å, and as a fraction of half an edge of the box, which may shrink.
+#: Longest real-space cutoff that PME chooses in a liquid, Å, and as a fraction of half an edge of the box, which may
+#: shrink. In a dilute box it is longer, as distances between molecules are.
 LONGEST_CUTOFF, SHRINKAGE = 14.0, 0.9
 #: Largest number of k-vectors along an edge, as for forces.ewald_k_max: more would take all memory.
 MOST_K_VECTORS = 1000
@@ -51,11 +52,12 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
     if charges.count == 0:
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
-    part = accuracy / sqrt(2)  # of the real-space and of the reciprocal error
+    filled = filled_fraction(composition.species, composition.counts, composition.space.volume)
+    part = accuracy * sqrt(filled / 2)  # of the real-space and of the reciprocal error, at the mean density
     free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (None,) * 4
     if forces.electrostatics == "pme" and free and not is_external:
-        longest = min(LONGEST_CUTOFF, SHRINKAGE * min(composition.space.edges) / 2)
-        cutoff = fastest_cutoff(charges, cell, longest, part) or cutoff
+        longest = min(LONGEST_CUTOFF * filled ** (-1 / 3), SHRINKAGE * min(composition.space.edges) / 2)
+        cutoff = fastest_cutoff(charges, cell, longest, part, filled) or cutoff
     cutoff = numbers["ewald_cutoff_A"] = forces.ewald_cutoff_A or cutoff
     unreachable = f"forces.ewald_accuracy = {accuracy:g}{_default(forces.ewald_accuracy)} cannot be reached"
     alpha = float(forces.ewald_alpha_per_A or alpha_for(charges, cutoff, composition.space.volume, part))
@@ -139,6 +141,8 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with an Ewald sum. Raises SceneError."""
     forces, (sites, charge_e), (real, k_space, vectors) = parts.scene.forces, parts.charged(), _errors(parts)
+    filled = filled_fraction(parts.species, parts.counts, parts.space.volume)
+    real, k_space = real / sqrt(filled), k_space / sqrt(filled)
     alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
