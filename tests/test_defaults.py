@@ -1,5 +1,6 @@
 """The defaults of users: electrostatics, truncation of charges, tail correction, real-space cutoff of PME, precision."""
 
+import json
 from math import erfc, inf, sqrt
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.special import erfcinv
 from support import (
     MARGIN,
     MIXED_ERROR,
+    ROOT,
     SCHEMES,
     WITH_THERMOSTAT,
     build,
@@ -21,7 +23,8 @@ from support import (
     step_error,
 )  # fmt: skip
 
-from rigidmd import Scene, Simulation
+from rigidmd import Scene, Simulation, resolve
+from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError
 from rigidmd.units import COULOMB, COULOMB_CHARGE, KJ_PER_MOL
 
@@ -271,3 +274,14 @@ def test_the_error_of_velocity_verlet_is_known():
     species = build(scene()).species
     assert error_of_step(species, 0.0, SCHEMES["velocity_verlet"], 2.0) == 0.0
     assert error_of_step(species, 298.15, SCHEMES["velocity_verlet"], 2.0) > 100 * MARGIN * MIXED_ERROR
+
+
+@pytest.mark.parametrize("edge", [40.0, 200.0])
+def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
+    """The mean density of the box would allow errors that a droplet or a pair of molecules in a gas does not have."""
+    path = ROOT / "systems" / "water_from_structure.toml"
+    assert main(["energy", str(path), "--accuracy", "--json", "--set", f"box.lengths_A={edge}"]) == 0
+    found = json.loads(capsys.readouterr().out)["accuracy"]
+    assert 1e-7 < found["in_e2_per_A2"] < 5e-5
+    scene = resolve(Scene.read(path, {"box.lengths_A": edge}))
+    assert max(scene.forces.pme_grid) <= 24  # a spacing that the box would not allow at a cutoff of 14 Å
