@@ -6,6 +6,15 @@ A comment before a block tells this file how to treat it:
     <!-- test: with OPTIONS -->    OPTIONS are added to each `rigidmd run`, `accuracy` and `sweep` of the block, and those
                                    of --set to each `Scene.read` of a Python block: shorter runs
     <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
+    <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
+                                   of the document where it is one of its commands, else as it stands
+    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces before it: of a longer run,
+                                   another machine or another version of another program
+    <!-- output: WHERE -->         the block is not compared: WHERE has the version, the command and the machine that made it
+    <!-- test: not output, WHY --> the block is a text that no command prints
+
+In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for any such number: it is
+a rounding error. Every block of text has one of these comments.
 
 Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
 """
@@ -25,7 +34,18 @@ from typing import NamedTuple
 
 import pytest
 from pydantic import BaseModel
-from support import BY_EXTENSION, CHAPTERS, DOCS, ROOT, describe, find_example, read_parameters, read_scene
+from support import (
+    BY_EXTENSION,
+    CHAPTERS,
+    DOCS,
+    ROOT,
+    SCHEMES,
+    WITH_THERMOSTAT,
+    describe,
+    find_example,
+    read_parameters,
+    read_scene,
+)
 
 import rigidmd
 from rigidmd.commands import cli
@@ -64,8 +84,8 @@ def blocks_of(document: Path) -> list[Block]:
     found, told, k = [], "", 0
     while k < len(lines):
         line = lines[k]
-        if marker := re.fullmatch(r"<!-- test: (.*) -->", line):
-            told = marker[1]
+        if marker := re.fullmatch(r"<!-- (test|output): (.*) -->", line):
+            told = marker[2] if marker[1] == "test" else f"recorded {marker[2]}"
             assert lines[k + 1].startswith("```"), f"{document.name}:{k + 1}: a block must follow at once"
         elif line.startswith("```"):
             end = lines.index("```", k + 1)
@@ -85,16 +105,37 @@ def commands_of(text: str) -> list[list[str]]:
     return [shlex.split(part, comments=True) for line in joined.splitlines() for part in line.split("&&")]
 
 
+NUMBER = r"[+-]?\d[\d,.]*(?:e[+-]?\d+)?"
+ROUNDING = r"\d(?:\.\d+)?e-[1-9]\d|0\.0e\+00"
+
+
+def pattern_of(quoted: str, like: bool) -> re.Pattern:
+    """What a quoted line of output stands for; with `like`, of any numbers."""
+
+    def form(part: str) -> str:
+        if part == "...":
+            return ".*"
+        if like and part.isspace():
+            return r"\s*"
+        if re.fullmatch(ROUNDING, part) and not like:
+            return f"(?:{ROUNDING})"
+        return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
+
+    parts = re.split(rf"(\.\.\.|\s+|{ROUNDING}|{NUMBER})", quoted)
+    return re.compile("".join(map(form, parts)) + r"\s*")
+
+
 class Reader:
     """Does what a document tells its reader to do, in the working directory."""
 
     def __init__(self, monkeypatch, capsys):
         self.monkeypatch, self.capsys = monkeypatch, capsys
         self.namespace: dict = {"__name__": "__main__"}
+        self.printed: dict[str, str] = {}  # by the commands so far
 
     def follow(self, block: Block) -> None:
         how, _, rest = block.told.partition(" ")
-        assert how in ("", "file", "with", "not"), block.told
+        assert how in ("", "file", "with", "not", "output", "recorded"), block.told
         if how == "file":
             Path(rest).write_text(block.text + "\n", encoding="utf-8")
         options = shlex.split(rest) if how == "with" else []
@@ -105,8 +146,25 @@ class Reader:
             self.scene(tomllib.loads(block.text), rest if how == "file" else "")
         elif block.language == "python" and how != "file":
             self.python(block, options)
+        elif how == "output":
+            kind, _, command = rest.partition(" ")
+            assert kind in ("of", "like"), block.told
+            self.output(command, block.text, kind == "like")
+
+    def output(self, command: str, text: str, like: bool) -> None:
+        """Every line of a block must be in the output of a command, in this order."""
+        words = shlex.split(command)
+        if shlex.join(words) not in self.printed:
+            self.command(words, [], runs=True)
+        printed = self.printed[shlex.join(words)]
+        remaining = iter(printed.splitlines())
+        for quoted in filter(lambda line: line.strip() not in ("", "..."), text.splitlines()):
+            pattern = pattern_of(quoted, like)
+            found = any(pattern.fullmatch(line) for line in remaining)
+            assert found, f"not in the output, or not in this order: {quoted!r}\n{printed}"
 
     def command(self, words: list[str], options: list[str], runs: bool) -> None:
+        given = shlex.join(words)
         match words:
             case ["rigidmd", *arguments]:
                 if arguments[0] in ("run", "accuracy", "sweep"):
@@ -117,6 +175,7 @@ class Reader:
                     code = cli.main(arguments)
                     said = self.capsys.readouterr()
                     assert code == 0, said.err
+                    self.printed[given] = said.out
                     if to is not None:
                         to.write_text(said.out)
             case ["python", script, *arguments] if script.startswith("tests/"):
@@ -398,3 +457,45 @@ def test_help_lists_and_prints_the_chapters(capsys):
 def test_a_chapter_that_is_not_there(name, expected, capsys):
     assert cli.main(["help", name]) == 2
     assert expected in capsys.readouterr().err
+
+
+GROUPS = {
+    "water": "Water",
+    "ion": "Ions",
+    "noble gas": "Noble gases",
+    "gas": "Gases",
+    "organic": "Organic molecules",
+}
+
+
+def models_tables() -> str:
+    """The tables of reference/models.md, from the files of the models."""
+    rows: dict[str, list[str]] = {group: [] for group in GROUPS}
+    for path in sorted((ROOT / "rigidmd" / "models").glob("*.toml")):
+        model = tomllib.loads(path.read_text(encoding="utf-8"))
+        mixing = "geometric mixing" if model.get("mixing") == "geometric" else ""
+        remarks = "; ".join(filter(None, [model.get("note"), mixing]))
+        cells = [f"`{model['name']}`", model["title"], str(len(model["sites"])), remarks, model["source"]]
+        row = f"| {' | '.join(cells)} |".replace("|  |", "| |")
+        rows[model["group"]].append(re.sub(r"doi:([^\s)|]+)", r"[doi:\1](https://doi.org/\1)", row))
+    head = "| model | molecule | sites | remarks | source |\n|---|---|---|---|---|\n"
+    return "\n\n".join(f"## {GROUPS[group]}\n\n{head}" + "\n".join(rows[group]) for group in GROUPS) + "\n"
+
+
+def test_the_table_of_integrators_has_their_orders_and_costs():
+    table = section("Shipped integrators")
+    rows = {}
+    for names, order, cost in re.findall(r"^\| (`.*?`)(?: \(default\))? \| (\d+) \| (\d+) \|", table, re.MULTILINE):
+        rows |= dict.fromkeys(re.findall(r"`(\w+)`", names), (int(order), int(cost)))
+    shipped = SCHEMES | WITH_THERMOSTAT
+    assert rows == {name: (scheme.order, scheme.force_evaluations) for name, scheme in shipped.items()}
+
+
+def test_the_page_of_models_has_the_tables_of_their_files():
+    """`python tests/test_docs.py` writes them."""
+    assert CHAPTERS["models"].read_text(encoding="utf-8").endswith("\n" + models_tables())
+
+
+if __name__ == "__main__":
+    text = CHAPTERS["models"].read_text(encoding="utf-8")
+    CHAPTERS["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")

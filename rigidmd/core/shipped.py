@@ -30,7 +30,7 @@ SECTIONS = {
         "engines", "extending",
     ),
     "theory": ("interactions", "sampling", "errors", "glossary"),
-    "reference": ("commands", "scene", "body", "files", "integrators", "python"),
+    "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
     "evidence": ("benchmarks", "validation"),
     "project": ("architecture", "changelog"),
 }  # fmt: skip
