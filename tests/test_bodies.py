@@ -58,7 +58,7 @@ def worst(results, name):
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 def test_every_scene_keeps_what_it_should_and_says_what_to_look_at(path):
-    assert "What to look at" in path.read_text()
+    assert "What to look for" in path.read_text()
     results = run(path.stem)
     assert len(results["time"]) >= 450  # enough to draw
     assert results["time"][-1] == pytest.approx(results.system.scene.run.duration_s)
