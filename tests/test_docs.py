@@ -8,8 +8,8 @@ A comment before a block tells this file how to treat it:
     <!-- test: not run, WHY -->    commands are parsed, and their scenes read, but not run
     <!-- test: output of CMD -->   every line of the block is in the output of CMD, in this order. CMD runs with the options
                                    of the document where it is one of its commands, else as it stands
-    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces before it: of a longer run,
-                                   another machine or another version of another program
+    <!-- test: output like CMD --> the same, but each number may be any number, with any spaces before it, and a line may be
+                                   longer: the block is of a longer run, another machine or version of another program
     <!-- output: WHERE -->         the block is not compared: WHERE has the version, the command and the machine that made it
     <!-- test: not output, WHY --> the block is a text that no command prints
 
@@ -122,7 +122,7 @@ def pattern_of(quoted: str, like: bool) -> re.Pattern:
         return NUMBER if like and re.fullmatch(NUMBER, part) else re.escape(part)
 
     parts = re.split(rf"(\.\.\.|\s+|{ROUNDING}|{NUMBER})", quoted)
-    return re.compile("".join(map(form, parts)) + r"\s*")
+    return re.compile("".join(map(form, parts)) + (".*" if like else r"\s*"))
 
 
 class Reader:
