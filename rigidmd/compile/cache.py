@@ -37,8 +37,9 @@ from rigidmd.errors import RigidMDWarning
 PACKAGE = Path(__file__).parent.parent
 #: Files and folders with kernels; tests/test_architecture.py checks that no other file has one.
 COMPILED = (
-    "errors.py", "units.py", "core/integrators.py", "core/state.py", "compile", "mechanics", "forces", "dynamics",
-    "analysis/pair_histogram.py", "engines/protocol.py", "engines/cpu", "engines/ode",
+    "errors.py", "units.py", "core/files.py", "core/integrators.py", "core/process.py", "core/state.py", "core/toml.py",
+    "core/user_modules.py", "compile", "mechanics", "forces", "dynamics", "analysis/pair_histogram.py",
+    "engines/protocol.py", "engines/cpu", "engines/ode",
 )  # fmt: skip
 UNUSED_AFTER_DAYS = 30.0
 

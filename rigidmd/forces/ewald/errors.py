@@ -75,7 +75,7 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
 
 def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> float:
     """The part of a volume (Å³) that molecules fill where they touch each other, at most 1. In a dilute box the error
-    of forces is that of such a cluster, not that of the mean density."""
+    of forces is that of such a cluster, not the error at the mean density."""
     filled = 0.0
     for m, n in zip(species, map(int, counts), strict=True):
         filled += n * (2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma)) ** 3
