@@ -24,6 +24,7 @@ _SHIPPED = re.compile(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.ipynb|\.p
 KINDS = {".toml": "scene", ".ipynb": "notebook", ".py": "script"}
 #: Folders of the documentation and their chapters, in the order of the list.
 SECTIONS = {
+    "start": ("installation", "why"),
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
         "npt", "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
@@ -32,7 +33,7 @@ SECTIONS = {
     "theory": ("interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
     "evidence": ("benchmarks", "validation"),
-    "project": ("architecture", "changelog"),
+    "project": ("contributing", "architecture", "changelog"),
 }  # fmt: skip
 CHAPTERS = {name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names}
 
