@@ -22,6 +22,7 @@ Commands and snippets of a document run in their order, in one folder that has a
 import argparse
 import contextlib
 import csv
+import json
 import os
 import re
 import shlex
@@ -424,6 +425,9 @@ def test_author_and_version_are_the_same_wherever_they_are_said():
     assert f"version {version}," in text
     assert f"version = {{{version}}}" in text
     assert f"\n## {version}" in CHAPTERS["changelog"].read_text(encoding="utf-8")
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
+    assert found == [version, project["keywords"], project["license"], [{"name": author["name"]}]]
 
 
 def test_help_lists_and_prints_the_chapters(capsys):
