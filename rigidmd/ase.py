@@ -26,9 +26,12 @@ from rigidmd.engines.system import System
 from rigidmd.errors import RigidMDWarning, SceneError, StructureError
 from rigidmd.io.formats import STRUCTURE
 from rigidmd.io.formats.cells import basis_of, least_skewed_cell, standard_rotation
+from rigidmd.io.formats.through_ase import atoms_of_sites
 from rigidmd.io.structure_file import read_atoms
+from rigidmd.io.trajectory import read_frames
 from rigidmd.run.atom_forces import Form, ase_results
 from rigidmd.run.minimise import minimise
+from rigidmd.run.record import read_record
 from rigidmd.run.summary import describe_minimum, minimum_figures
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.forces import Forces
@@ -46,33 +49,19 @@ TABLES = ("forces", "fields", "precision")
 class RigidMD(Calculator):
     """Energy, forces and stress of rigid molecules, for the atoms that it is attached to.
 
-    Each call fits rigid molecules to the atoms, by least squares with masses, as for structure files. Massless sites
-    (M of TIP4P) are not among the atoms. All axes are periodic or none.
-
-    energy, free_energy : eV, of the fitted molecules
-    forces : eV/Å, minus the gradient of this energy: force and torque of each molecule are distributed on its atoms
-        like the forces of a rigid motion, and are 0 at a minimum. With atom_forces="sites" each atom has the forces of
-        its own site; the forces of massless sites are distributed on the atoms, with the coefficients of linear
-        combinations of atoms, else as the least forces. Total force and torque on a molecule are the same, and with
-        constraints on all distances (`ase.constraints.FixBondLengths`) both are equal
-    stress : eV/Å³, signs and order of ASE, from the molecular virial: the derivative with a strain that moves centres
-        of mass without rotation. Where torques are 0 it is also the derivative with a strain of all atoms
-
-    ASE moves atoms, and without constraints molecules bend. The energy does not change then; distances beyond `bend`
-    give a warning, distances beyond `tolerance` an error. `minimise` moves rigid molecules instead, and `make_rigid`
-    moves atoms to their positions in the fitted molecules.
+    Each call fits rigid molecules to the atoms, by least squares with masses. Massless sites (M of TIP4P) are not among
+    the atoms. All axes are periodic or none. The page `ase` (`rigidmd help ase`) defines energy (eV), forces (eV/Å) and
+    stress (eV/Å³), and describes what happens when ASE bends molecules.
 
     Parameters
     ----------
     models : names of shipped models or paths of .toml files, or tables like [[molecules]] of a scene file; or a scene,
         whose species, [forces], [fields], precision and forces from Python (`with_user_code`) are used
-    atom_forces : "gradient" or "sites", see above
-    bend : largest distance of an atom from its position in a rigid molecule without a warning, over the molecule's
-        radius
-    tolerance : the same without an error
+    atom_forces : "gradient" of the energy of the fitted molecules, or of "sites": each atom has the forces of its site
+    bend, tolerance : largest distance of an atom from its rigid position without a warning, and without an error,
+        over the molecule's radius
     precision : "double", the default, or "mixed"
-    fields : the table [fields] of a scene file
-    forces : keys of the table [forces]: cutoff_A, electrostatics, truncation, ...
+    fields, forces : the table [fields] of a scene file, and keys of its table [forces]: cutoff_A, electrostatics, ...
 
     Raises SceneError or StructureError if atoms and models do not match.
     """
@@ -91,8 +80,8 @@ class RigidMD(Calculator):
             faults.append(f"atom_forces is {atom_forces!r}, must be 'gradient' or 'sites'")
         if not 0 < bend <= tolerance < 1:
             faults.append(f"bend = {bend} and tolerance = {tolerance}: must be 0 < bend <= tolerance < 1")
-        tables = {"precision": precision, "fields": fields, "forces": forces or None}
-        given = {key: value for key, value in tables.items() if value is not None}
+        tables = (("precision", precision), ("fields", fields), ("forces", forces or None))
+        given = {key: value for key, value in tables if value is not None}
         known = list(Forces.model_fields)
         faults += [f"unknown keyword {key}{did_you_mean(key, known)}" for key in forces if key not in known]
         self._user_forces: tuple[Any, ...] = ()
@@ -145,8 +134,7 @@ class RigidMD(Calculator):
     def minimise(self, atoms: Atoms, **stage_keys: Any) -> dict[str, Any]:
         """Move rigid molecules to a near minimum of the energy, or of the enthalpy with pressure_bar.
 
-        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, torque_limit_kJ_mol,
-            pressure_bar, pressure_coupling, ...
+        stage_keys : keys of a stage with ensemble = "minimise": force_limit_kJ_mol_A, pressure_bar, ...
 
         Sets positions, and the cell with pressure_bar. Constraints of the atoms are ignored; models set what is frozen.
         Returns the values of the minimum, as in summary.json. Raises SceneError, SimulationError.
@@ -213,9 +201,8 @@ class RigidMD(Calculator):
             image = np.rint((fitted.atoms_as_given - before) @ np.linalg.inv(fitted.state.cell))
             after = after + image @ state.cell
             if not np.array_equal(state.cell, fitted.state.cell):
-                sign = np.sign(np.linalg.det(atoms.cell.array))
                 given = np.linalg.inv(assembly.basis) @ state.cell @ rotation
-                atoms.set_cell(given * np.array([1, 1, sign])[:, None])
+                atoms.set_cell(given * np.array([1, 1, np.sign(np.linalg.det(atoms.cell.array))])[:, None])
         positions[assembly.order] = after @ rotation
         atoms.set_positions(positions, apply_constraint=False)
 
@@ -280,9 +267,16 @@ class _Assembly(NamedTuple):
         return self.system.site_positions(state)[self.system.sites.mass > 0]
 
 
+def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
+    """Frames of a run for `ase.io.read`; `name` is its folder, or the trajectory in it. Raises OutputError."""
+    record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
+    found = read_frames(record.trajectory, record.molecules.site_count, most=1 << 60)
+    arrays = [[None] * len(found.time) if a is None else a for a in (found.positions, found.velocities, found.cells)]
+    return [atoms_of_sites(record.molecules, *frame) for frame in zip(*arrays, found.time.tolist(), strict=True)][index]
+
+
 def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The tables of the species of a scene without numbers of molecules, and the other tables that a calculator uses;
-    paths are absolute."""
+    """The tables of a scene's species without numbers of molecules, and the other TABLES; paths are absolute."""
     tables = scene.model_dump(exclude_defaults=True)
     paths = [*((table, key) for table in tables["molecules"] for key in ("file", "parameters"))]
     paths += [(force, "module") for force in tables.get("forces", {}).get("custom", ())]

@@ -158,6 +158,7 @@ NAMED_EXTENSIONS = {
     "engines/lammps/files.py": "the files of an export, and commands of LAMMPS",
     "engines/lammps/options.py": "the command that runs an export",
     "engines/openmm/files.py": "the files of an export, and its script",
+    "io/ase_plugin.py": "names of files that ASE cannot read, which it matches without loading the formats",
 }
 
 
@@ -195,6 +196,10 @@ def loaded_by(script):
 
 def test_a_scene_needs_neither_scipy_nor_numba():
     assert not {"scipy", "numba", "ase", "MDAnalysis", "matplotlib"} & loaded_by("import rigidmd.scene")
+
+
+def test_ase_loads_little_of_rigidmd():
+    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & loaded_by("import rigidmd.io.ase_plugin")
 
 
 @pytest.mark.parametrize("output", [{"trajectory": False, "figures": False}, {}], ids=["no output", "trajectory"])

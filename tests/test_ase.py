@@ -4,7 +4,9 @@ import contextlib
 import pickle
 import subprocess
 import sys
+import tomllib
 import warnings
+from importlib.metadata import EntryPoint
 
 import ase.io
 import numpy as np
@@ -596,6 +598,33 @@ def test_ase_opens_it(traj, tmp_path):
     assert [row.energy for row in base.select()] == pytest.approx(results["potential"] * KJ_PER_MOL / EV)
     ase.io.write(tmp_path / "all.traj", results.atoms(":"))
     assert ase.io.read(tmp_path / "all.traj", -1).get_stress() == pytest.approx(results.atoms().get_stress())
+
+
+@pytest.mark.parametrize("name", ["trajectory.xtc", "trajectory.trr", "trajectory.gsd"])
+def test_ase_reads_a_run(name, tmp_path, monkeypatch):
+    """By the entry point of pyproject.toml, as ASE does when it is imported."""
+    ((group, names),) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"].items()
+    monkeypatch.delitem(ase.io.formats.ioformats, "rigidmd", raising=False)  # of an installed package
+    (point,) = (EntryPoint(key, value, group) for key, value in names.items())
+    assert (point.name, point.group) == ("rigidmd", "ase.ioformats")
+    ase.io.formats.define_external_io_format(point)
+    made = small_scene({"tip4p2005": 4}, 14.0, forces=FORCES, stages=[NVE], output=OUTPUT | {"trajectory": name})
+    results = Simulation(made, tmp_path / "run").run()
+    frames, expected = ase.io.read(tmp_path / "run" / name, ":"), results.atoms(":")
+    assert len(frames) == len(expected) == 4
+    assert ase.io.read(tmp_path / "run", format="rigidmd") == frames[-1]
+    assert ase.io.read(tmp_path / "run" / name, 1) == frames[1]
+    for frame, other in zip(frames, expected, strict=True):
+        assert frame.info["time_ps"] == pytest.approx(other.info["time_ps"])
+        assert frame.positions == pytest.approx(other.positions, abs=0.02 if name.endswith("xtc") else 1e-5)
+        assert frame.has("momenta") == (name != "trajectory.xtc")
+        assert frame.cell.array == pytest.approx(other.cell.array) and frame.pbc.all()
+        assert (frame.get_masses() == other.get_masses()).all() and str(frame.symbols) == "OH2OH2OH2OH2"
+    Simulation(Scene.read(ROOT / "systems" / "heavy_top_1.toml", {"run.duration_s": 0.01}), tmp_path / "top").run()
+    with pytest.raises(TypeError, match="a run of a single body"):
+        ase.io.read(tmp_path / "top" / "trajectory.xtc")
+    with pytest.raises(OutputError, match="is not the folder of a run"):
+        ase.io.read(tmp_path, format="rigidmd")
 
 
 def test_a_run_with_it_goes_on_to_the_same_bytes(tmp_path):

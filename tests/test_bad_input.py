@@ -263,7 +263,11 @@ def test_a_command_line_that_is_not_known_suggests_what_is(words, expected, caps
 
 @pytest.mark.parametrize(
     ("word", "expected"),
-    [("restarts", "there are installation, why"), ("rdf", "the word is in water ("), ("maesuring", "did you mean measuring?")],
+    [
+        ("restarts", "there are installation, why"),
+        ("rdf", "the word is in water ("),
+        ("maesuring", "did you mean measuring?"),
+    ],
 )
 def test_help_finds_words_in_chapters(word, expected, capsys):
     assert main(["help", word]) == 2
