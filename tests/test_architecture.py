@@ -199,7 +199,10 @@ def test_a_scene_needs_neither_scipy_nor_numba():
 
 
 def test_ase_loads_little_of_rigidmd():
-    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & loaded_by("import rigidmd.io.ase_plugin")
+    (point,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["ase.ioformats"].items()
+    found = loaded_by(f"from importlib.metadata import EntryPoint\nEntryPoint(*{point}, 'ase.ioformats').load()")
+    assert "rigidmd.io.ase_plugin" in found
+    assert not {"numba", "MDAnalysis", "matplotlib", "rigidmd.io.formats"} & found
 
 
 @pytest.mark.parametrize("output", [{"trajectory": False, "figures": False}, {}], ids=["no output", "trajectory"])
