@@ -36,10 +36,10 @@ class EnergyWalk(NamedTuple):
 
         D = scale w dt^(2k+2),    w = sum_n |sum_i b_i exp(2 pi i n c_i)|² / n^(2k+2)
 
-    with a scale of the scene that no integrator changes. `switch` has k = 2, `smooth_switch` 5, `shift` 0; single
-    precision of the forces acts as k = -1/2. In 27 SPC/E waters D of srkn_4 at 8, 4 and 2 fs was 2e-7, 1.7e-9 and
-    2.3e-11 kT²/ps per degree of freedom with `switch`; D of srkn_4 over D of srkn_6 at 4 fs was 34 with `switch` (here
-    41) and 970 with `smooth_switch` (885).
+    with a scale of the scene that no integrator changes. `switch` has k = 2, `shift` 0, `smooth_switch` 4, but acts as
+    5 at 2 to 8 fs; single precision of the forces acts as k = -1/2. In 27 SPC/E waters D of srkn_4 at 8, 4 and 2 fs was
+    2e-7, 1.7e-9 and 2.3e-11 kT²/ps per degree of freedom with `switch`; D of srkn_4 over D of srkn_6 at 4 fs was 34
+    with `switch` (here 41) and 970 with `smooth_switch` (885).
 
     D is in squares of the energy unit of a `TrialSystem` per unit of time of its span.
     """
