@@ -30,7 +30,7 @@ SECTIONS = {
         "npt", "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
         "engines", "extending",
     ),
-    "theory": ("interactions", "sampling", "errors", "glossary"),
+    "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
     "evidence": ("benchmarks", "validation"),
     "project": ("contributing", "architecture", "changelog"),
