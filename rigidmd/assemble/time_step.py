@@ -46,8 +46,8 @@ def _trace(scheme: Scheme, square: np.ndarray) -> np.ndarray:
 
 @cache
 def stable_angle(method: Scheme | Solver) -> float:
-    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps: while
-    |trace| <= 2 (docs/theory/dynamics.md). Infinite for solvers that choose their own steps."""
+    """Largest w dt at which a harmonic motion of angular frequency w stays bounded, for this and all smaller steps:
+    while |trace| <= 2 (docs/theory/dynamics.md). Infinite for solvers that choose their own steps."""
     if isinstance(method, Solver):
         return 2 * sqrt(2) if method.name == RK4 else inf
     angle = np.linspace(0, 30, 30_001)
