@@ -10,16 +10,26 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from rigidmd.figures.style import INK, camera, circle
-from rigidmd.mechanics.rotation import from_euler_angles
-
-PHI, THETA, PSI = np.radians([40.0, 40.0, 52.0])
-LAB, BODY = "#2b6f9e", "#c8553d"
+INK, LAB, BODY = "#1f2430", "#2b6f9e", "#c8553d"
 ANGLES = {"phi": "#7a5ca3", "theta": "#4f8a5b", "psi": "#b8862d"}
-VIEW = camera(np.array([np.cos(np.radians(34.0)), np.sin(np.radians(34.0)), 0.55]), np.array([0.0, 0.0, 1.0]))
+PHI, THETA, PSI = np.radians([40.0, 40.0, 52.0])
+X, Y, Z = np.eye(3)
 
-Q = from_euler_angles(np.array([PHI, THETA, PSI]))
-NODE = from_euler_angles(np.array([PHI, 0.0, 0.0]))[:, 0]
+
+def about(axis, angle):
+    """The rotation matrix about lab axis 0 or 2."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    rotation = np.eye(3)
+    rotation[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return rotation
+
+
+Q = about(2, PHI) @ about(0, THETA) @ about(2, PSI)
+NODE = about(2, PHI) @ X
+#: Rows: to the right, upwards and towards the eye.
+VIEW = np.array([[-np.sin(0.593), np.cos(0.593), 0.0], [0.0, 0.0, 0.0], [np.cos(0.593), np.sin(0.593), 0.55]])
+VIEW[2] /= np.linalg.norm(VIEW[2])
+VIEW[1] = np.cross(VIEW[2], VIEW[0])
 
 figure = Figure(figsize=(7.2, 5.4))
 axes = figure.add_axes((0, 0, 1, 1))
@@ -32,8 +42,9 @@ def flat(points):
     return np.asarray(points) @ VIEW[:2].T
 
 
-def disc(normal, color):
-    edge = circle(normal)
+def disc(first, second, color):
+    angle = np.linspace(0, 2 * np.pi, 361)[:, None]
+    edge = np.cos(angle) * first + np.sin(angle) * second
     depth = edge @ VIEW[2]
     axes.fill(*flat(edge).T, color=color, alpha=0.07, lw=0)
     for front, alpha, dashes in ((depth >= 0, 0.9, "-"), (depth < 0, 0.45, (0, (4, 3)))):
@@ -65,9 +76,8 @@ def arc(start, toward, angle, radius, color, label, reach=1.22, part=0.5):
     axes.text(*flat(middle), label, color=color, fontsize=18, ha="center", va="center", zorder=6)
 
 
-X, Y, Z = np.eye(3)
-disc(Z, LAB)
-disc(Q[:, 2], BODY)
+disc(X, Y, LAB)
+disc(Q[:, 0], Q[:, 1], BODY)
 line = np.array([-1.0, 1.25])[:, None] * NODE
 axes.plot(*flat(line).T, color=INK, lw=1.2, ls=(0, (6, 3)), zorder=3)
 axes.text(*(flat(1.36 * NODE) - (0.0, 0.01)), "line of nodes", color=INK, fontsize=12, ha="center", va="center")
