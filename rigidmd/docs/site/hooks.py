@@ -22,7 +22,12 @@ LIVE = {
     "water": ("--set", "output.trajectory_interval_ps=0.5"),
 }  # fmt: skip
 API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
-CSS = """.md-typeset math { font-size: 1.08em; }
+CSS = """math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math; }
+.md-typeset math { font-size: 1.08em; }
+.md-typeset math mi[mathvariant^=bold] { font-weight: bold; }
+.md-typeset mtd[columnalign=right] { text-align: right; }
+.md-typeset mtd[columnalign=left] { text-align: left; }
+.md-typeset td:first-child code, .md-typeset th code { white-space: nowrap; }
 .md-typeset div.arithmatex { overflow-x: auto; overflow-y: hidden; padding: .3em 0; }
 .md-typeset .docstring { white-space: pre-line; }
 .md-typeset table:not([class]) td, .md-typeset table:not([class]) th { padding: .5em .8em; min-width: 0; }
