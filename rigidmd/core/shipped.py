@@ -27,8 +27,9 @@ SECTIONS = {
     "start": ("installation", "why"),
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
-        "npt", "ensembles", "electrostatics", "structures", "analysis", "studies", "pictures", "resume", "stops", "ase",
-        "engines", "extending",
+        "npt", "time_step", "ensembles", "electrostatics", "structures", "tables", "slab", "analysis", "transport",
+        "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures", "ase", "engines",
+        "coming_from", "extending",
     ),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
@@ -128,8 +129,7 @@ def chapter_text(name: str) -> str:
 
 def _plain(name: str) -> str:
     """The text of a chapter. Shipped files are named as `rigidmd new` copies them, not by their paths."""
-    text = CHAPTERS[name].read_text(encoding="utf-8")
-    text = re.sub(r"<!--.*?-->\n?", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->\n?", "", CHAPTERS[name].read_text(encoding="utf-8"), flags=re.DOTALL)
     copied = sorted(set(_SHIPPED.findall(text)))
     title, _, text = text.partition("\n")
     if copied:
