@@ -285,3 +285,20 @@ def test_a_droplet_in_a_large_box_has_the_accuracy_of_a_liquid(edge, capsys):
     assert 1e-7 < found["in_e2_per_A2"] < 5e-5
     scene = resolve(Scene.read(path, {"box.lengths_A": edge}))
     assert max(scene.forces.pme_grid) <= 24  # a spacing that the box would not allow at a cutoff of 14 Å
+
+
+@pytest.mark.parametrize(
+    ("integrator", "forces", "warned"),
+    [
+        ("srkn_4", {}, True), ("srkn_4", {"truncation": "plain"}, True), ("srkn_4", {"truncation": "smooth_switch"}, False),
+        ("velocity_verlet", {}, False), ("srkn_4", {"lennard_jones": False}, False),
+    ],
+)  # fmt: skip
+def test_check_warns_of_an_order_that_the_truncation_does_not_allow(integrator, forces, warned, tmp_path, capsys):
+    forces = "".join(f"{key} = {json.dumps(value)}\n" for key, value in forces.items())
+    text = f'[box]\nlengths_A = 40\n[[molecules]]\nmodel = "spce"\ncount = 8\n[forces]\n{forces}[start]\ntemperature_K = 300\n'
+    (tmp_path / "s.toml").write_text(
+        f'{text}[[stages]]\nduration_ps = 0.1\ntimestep_fs = 1\nintegrator = "{integrator}"\n'
+    )
+    assert main(["check", str(tmp_path / "s.toml")]) == 0
+    assert ("forces jump to 0 at the cutoff" in capsys.readouterr().err) == warned
