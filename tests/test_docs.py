@@ -14,7 +14,7 @@ A comment before a block tells this file how to treat it:
     <!-- test: not output, WHY --> the block is a text that no command prints
 
 In quoted output `...` stands for any text, a line of it for any lines, and a number below 1e-9 for any such number: it is
-a rounding error. Every block of text has one of these comments.
+a rounding error. Every quoted output has one of these comments.
 
 Commands and snippets of a document run in their order, in one folder that has a copy of systems/.
 """
