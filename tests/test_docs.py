@@ -137,6 +137,7 @@ class Reader:
     def follow(self, block: Block) -> None:
         how, _, rest = block.told.partition(" ")
         assert how in ("", "file", "with", "not", "output", "recorded"), block.told
+        assert block.told or block.language != "text" or "±" not in block.text, "quoted output must have its command"
         if how == "file":
             Path(rest).write_text(block.text + "\n", encoding="utf-8")
         options = shlex.split(rest) if how == "with" else []
