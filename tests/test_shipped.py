@@ -1,5 +1,7 @@
 """The scenes that travel with the package: `rigidmd examples`, `rigidmd new`, and what the wheel holds."""
 
+import os
+import pty
 import subprocess
 import sys
 import tomllib
@@ -18,12 +20,15 @@ def test_every_package_and_every_data_file_is_in_the_wheel():
     assert tool["package-dir"] == {"rigidmd.systems": "systems"}
     data = tool["package-data"]
     homes = {"rigidmd": ROOT / "rigidmd", "rigidmd.systems": ROOT / "systems"}
-    held = {file for name, home in homes.items() for pattern in data[name] for file in home.glob(pattern)}
+    scripts = (ROOT / "systems" / "scripts", ROOT / "rigidmd" / "docs" / "site")
+    held = {
+        file for name, home in homes.items() for pattern in data[name] for file in home.glob(pattern) if file.is_file()
+    }
     there = {
         file
         for home in homes.values()
         for file in home.rglob("*")
-        if file.is_file() and (file.suffix not in (".py", ".pyc") or file.parent == ROOT / "systems" / "scripts")
+        if file.is_file() and (file.suffix not in (".py", ".pyc") or file.parent in scripts)
     }
     assert held == there
 
@@ -120,3 +125,27 @@ def test_what_only_prints_is_quick_and_imports_nothing_heavy(arguments):
     code = f"import sys; from rigidmd.commands.cli import main\nmain({arguments})\nprint(sorted({{'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_has_lines_for_a_terminal(capsys):
+    assert main(["help"]) == 0
+    assert max(len(line) for line in capsys.readouterr().out.splitlines()) <= 120
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_help_uses_a_pager_on_a_terminal(terminal):
+    command = [sys.executable, "-c", "import sys; from rigidmd.commands.cli import main; main(['help', 'top'])"]
+    settings = {"env": os.environ | {"PAGER": "sed s/^/paged:/", "TERM": "xterm"}, "timeout": 60}
+    if not terminal:
+        out = subprocess.run(command, **settings, capture_output=True, text=True).stdout
+        assert out.startswith("# ") and "paged:" not in out
+        return
+    leader, follower = pty.openpty()
+    process = subprocess.Popen(command, env=settings["env"], stdin=follower, stdout=follower, stderr=follower)
+    os.close(follower)
+    out = b""
+    while b"\n" not in out:
+        out += os.read(leader, 1000)
+    os.close(leader)
+    process.wait(60)
+    assert out.startswith(b"paged:# ")

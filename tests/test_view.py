@@ -143,7 +143,7 @@ def test_every_format_of_a_trajectory_can_be_looked_at(ending, tmp_path):
 def test_without_chemiscope_a_sentence_says_what_to_install(water, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
     assert cli.main(["view", str(water)]) == 2
-    assert capsys.readouterr().err.strip().endswith("needs the extra rigidmd[view]: pip install chemiscope")
+    assert capsys.readouterr().err.strip().endswith("needs chemiscope: pip install chemiscope")
     assert not (water / "view.html").exists()
 
 

@@ -4,18 +4,22 @@ from rigidmd.commands.arguments import Options, argument, command
 
 
 @command(
-    190, "list the chapters of the documentation, or print one", "rigidmd help water | less",
-    argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, or a word to find in them"),
+    190, "list the chapters of the documentation, or print one", "rigidmd help water",
+    argument("chapter", nargs="?", metavar="CHAPTER", help="chapter to print, on a terminal with $PAGER; or a word"),
 )  # fmt: skip
 def _help(options: Options) -> int:
+    import os
+    from pydoc import pager
+    from textwrap import fill
+
     from rigidmd.core.shipped import chapter_text, contents
 
     if options.chapter is not None:
-        print(chapter_text(options.chapter))
+        os.environ.setdefault("LESS", "FRX")  # `less` then ends at once after a text of one screen
+        pager(f"{chapter_text(options.chapter)}\n")  # $PAGER or `less` on a terminal, else plain text
         return 0
     print("chapters (`rigidmd help CHAPTER` prints one; `rigidmd COMMAND --help` describes a command):")
     for folder, found in contents().items():
-        print(f"\n{folder}")
-        for name, about in found.items():
-            print(f"  {name:<14}  {about}")
+        lines = [fill(f"  {name:<14}  {about}", 120, subsequent_indent=" " * 18) for name, about in found.items()]
+        print(f"\n{folder}", *lines, sep="\n")
     return 0

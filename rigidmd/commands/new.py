@@ -31,7 +31,7 @@ def _new(options: Options) -> int:
         print(f"  python {quoted}    runs it; `rigidmd help extending` explains it")
         return 0
     if example.kind == "notebook":
-        print("  open it in Jupyter, VS Code or any program for notebooks: pip install 'rigidmd[notebook]' jupyterlab")
+        print("  open it in Jupyter, VS Code or any program for notebooks: pip install chemiscope jupyterlab pandas")
         print(f"  jupyter lab {quoted}")
         return 0
     print(f"  rigidmd check {quoted}    describes the run without running it")

@@ -19,7 +19,7 @@ from rigidmd.core.toml import (
 from rigidmd.errors import SceneError
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
-    MOST_TABLES, Section, did_you_mean, location_of, numbers_out_of_range, similar_names, suggestion,
+    MOST_TABLES, Section, did_you_mean, exact_names, location_of, numbers_out_of_range, similar_names, suggestion,
     validation_messages,
 )  # fmt: skip
 
@@ -175,7 +175,7 @@ class Scene(Section, Displayed):
         wrong = numbers_out_of_range(data, *kind.SIZES)
         faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
         faults += kind.contradictions(data, text)
-        whole, rows = with_registered_rows(data)
+        whole, rows = with_registered_rows(exact_names(data, kind))
         scene = None
         try:
             scene = kind.model_validate(whole, context=rows)

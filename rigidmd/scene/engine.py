@@ -10,14 +10,13 @@ from rigidmd.scene.validation import Count, Section
 RIGIDMD = "rigidmd"
 _PROGRAMS = runnable()
 _TITLES = " or ".join(program.title for program in _PROGRAMS.values())
-_INSTALL = " or ".join(f"'rigidmd[{name}]'" for name in _PROGRAMS)
 
 
 class _Engine(Section):
     """The engine that moves the molecules. Start, log, trajectory and analysis are the same for all engines."""
 
     name: Literal[(RIGIDMD, *_PROGRAMS)] = Field(  # type: ignore[valid-type]
-        default=RIGIDMD, description=f"rigidmd itself, or {_TITLES} if installed (pip install {_INSTALL})"
+        default=RIGIDMD, description=f"rigidmd itself, or {_TITLES} if installed (pip install {' or '.join(_PROGRAMS)})"
     )
 
     def _errors(self):

@@ -2,7 +2,7 @@
 
 # isort: skip_file
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
@@ -11,7 +11,7 @@ from rigidmd.core.integrators import (
 )  # fmt: skip
 from rigidmd.core.toml import plain_values
 from rigidmd.errors import SceneError
-from rigidmd.scene.validation import Line, Section, validation_messages
+from rigidmd.scene.validation import Line, Section, exact_names, validation_messages
 
 RESERVED = (*SCHEMES, *WITH_THERMOSTAT, AUTO, *SOLVERS)
 Coefficient = Annotated[float, Strict(), Field(ge=-10, le=10)]
@@ -39,7 +39,7 @@ class IntegratorRow(Section):
     """Where the coefficients are from"""
 
     def _errors(self):
-        if self.name in RESERVED:
+        if exact_names(self.name, Literal[RESERVED]) in RESERVED:
             yield f"name: {self.name} is an integrator of rigidmd; choose another name"
         if (self.steps is None) == (self.kicks is None or self.drifts is None):
             yield "needs steps, or kicks and drifts"

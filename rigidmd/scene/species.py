@@ -3,14 +3,14 @@
 import re
 from math import cos, pi, radians, sqrt
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
 
 from rigidmd.io.formats import extensions
-from rigidmd.scene.models import Site, SiteName, model_error
-from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section
+from rigidmd.scene.models import Site, SiteName, available_models, model_error
+from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section, exact_names
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
@@ -73,6 +73,7 @@ class Molecules(Section):
     @field_validator("model")
     @classmethod
     def _is_known(cls, model: str | None):
+        model = exact_names(model, Literal[tuple(available_models())])
         if model is not None and (fault := model_error(model)):
             raise ValueError(fault)
         return model

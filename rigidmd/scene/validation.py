@@ -4,9 +4,12 @@ import ast
 import difflib
 import inspect
 import re
+import tomllib
 from collections.abc import Collection, Iterable
+from functools import cache
 from itertools import pairwise
 from math import isfinite
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -31,6 +34,9 @@ Flag = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
 
 T = TypeVar("T")
+
+#: Names of settings in other programs, by table and key of a scene.
+FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 
 #: Largest number of tables in a list of tables.
 MOST_TABLES = 1000
@@ -185,9 +191,10 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     context = detail.get("ctx", {})
     match detail["type"]:
         case "extra_forbidden":
-            known = _known_keys(model, keys[:-1])
+            known, name = _known_keys(model, keys[:-1]), str(keys[-1])
+            with_unit = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
             listed = f"; known here: {', '.join(known)}" if known else ""
-            return "unknown key" + (did_you_mean(str(keys[-1]), known) or listed)
+            return "unknown key" + ((not with_unit and _foreign(name, model)) or did_you_mean(name, known) or listed)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
@@ -202,6 +209,22 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case kind if kind in SENTENCES:
             return SENTENCES[kind].format(shown=shown, **context)
     return f"is {shown}: {detail['msg']}"
+
+
+def _foreign(name: str, model: type[BaseModel]) -> str:
+    """What a scene has for a setting of another program, for the message on its unknown key; empty for other names."""
+    for table, entries in tomllib.loads(FOREIGN_KEYS.read_text(encoding="utf-8")).items():
+        section, path = model.model_fields.get(table), [] if table == "scene" else [table]
+        for key, text in entries.items():
+            names, _, note = text.partition(": ")
+            if _plain(name) not in map(_plain, names.split()):
+                continue
+            if table == "none" and "stages" in model.model_fields:
+                return f"; not needed: {note}"
+            if (section or not path) and key in _known_keys(model, path):
+                place = f" in [[{table}]]" if "tuple" in str(section) else f" in [{table}]" if path else ""
+                return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
+    return ""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -248,6 +271,33 @@ def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
             return []
         model = inner[0]
     return list(model.model_fields)
+
+
+def exact_names(data: Any, annotation: Any) -> Any:
+    """Data of a type in which values with a fixed choice have their exact spelling: "NVT" becomes "nvt". The case of
+    letters, hyphens, underscores and slashes do not matter in scenes."""
+    if isinstance(data, str):
+        near = [name for name in _choices(annotation) if _plain(name) == _plain(data)]
+        return near[0] if len(near) == 1 else data
+    if isinstance(data, list):
+        return [exact_names(value, annotation) for value in data]
+    if not isinstance(data, dict):
+        return data
+    fields = {key: kind for model in _models_in(annotation) for key, kind in _annotations(model).items()}
+    return {key: exact_names(value, fields.get(key) if fields else annotation) for key, value in data.items()}
+
+
+@cache
+def _annotations(model: type[BaseModel]) -> dict[str, Any]:
+    return {key: field.rebuild_annotation() for key, field in model.model_fields.items()}
+
+
+def _choices(annotation: Any) -> list[str]:
+    """The values that a type allows, if it is a choice of names."""
+    if isinstance(annotation, str):
+        return [annotation]
+    parts = (*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ()))
+    return [*annotation.names] if isinstance(annotation, NameIn) else [n for part in parts for n in _choices(part)]
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -30,7 +30,7 @@ def chemiscope_script() -> str:
     try:
         return files("chemiscope").joinpath(*SCRIPT).read_text(encoding="utf-8")
     except (ImportError, OSError):
-        raise OutputError("the animation of molecules needs the extra rigidmd[view]: pip install chemiscope") from None
+        raise OutputError("the animation of molecules needs chemiscope: pip install chemiscope") from None
 
 
 def frames_of(record: Record, most: int) -> Frames:

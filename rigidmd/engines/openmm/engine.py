@@ -64,7 +64,7 @@ class OpenmmEngine(ExternalEngine):
         view, there = self._view, _platforms()
         if platform not in there:
             known = "" if platform in PLATFORMS else f"; OpenMM knows {', '.join(PLATFORMS)}"
-            cuda = "; pip install 'rigidmd[openmm-cuda]' installs it" if platform == "CUDA" else ""
+            cuda = "; pip install 'openmm[cuda12]' installs it" if platform == "CUDA" else ""
             raise EngineError(f"OpenMM has no platform {platform!r} here: there are {', '.join(there)}{known}{cuda}")
         properties = properties_of(platform, precision, system.scene.threads)
         self.version = f"OpenMM {mm.__version__} on {platform}"

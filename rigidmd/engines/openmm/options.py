@@ -27,7 +27,7 @@ def _describe(platform: str, precision: str | None) -> str:
 
 
 PROGRAM = Program(
-    "OpenMM", "pip install 'rigidmd[openmm]' installs it, and 'rigidmd[openmm-cuda]' with its platform CUDA",
+    "OpenMM", "pip install openmm installs it, and 'openmm[cuda12]' its platform CUDA too",
     "translations:TRANSLATIONS", engine="engine:OpenmmEngine", installed="engine:installed",
     options={
         "platform": Option(PLATFORMS, "CPU", "Platform of openmm; default: CPU"),

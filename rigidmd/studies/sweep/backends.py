@@ -212,7 +212,7 @@ class Cluster(Backend):
         try:
             from distributed import Client, LocalCluster
         except ImportError:
-            raise SettingError("--scheduler needs dask.distributed: pip install 'rigidmd[dask]'") from None
+            raise SettingError("--scheduler needs dask.distributed: pip install distributed") from None
         self._local_cluster = None
         try:
             if address == LOCAL:
