@@ -1,6 +1,8 @@
 """The defaults of users: electrostatics, truncation of charges, tail correction, real-space cutoff of PME, precision."""
 
 import json
+import re
+import tomllib
 from math import erfc, inf, sqrt
 
 import numpy as np
@@ -302,3 +304,21 @@ def test_check_warns_of_an_order_that_the_truncation_does_not_allow(integrator, 
     )
     assert main(["check", str(tmp_path / "s.toml")]) == 0
     assert ("forces jump to 0 at the cutoff" in capsys.readouterr().err) == warned
+
+
+def test_the_scene_of_a_run_has_no_keys_that_do_nothing(tmp_path):
+    stages = [{"ensemble": "minimise", "most_iterations": 2}, NVT]
+    ran = scene(stages=stages)
+    Simulation(ran, folder=tmp_path / "run").run()
+    tables = tomllib.loads((tmp_path / "run" / "scene.toml").read_text())
+    limits = {"most_iterations", "force_limit_kJ_mol_A", "torque_limit_kJ_mol"}
+    assert set(tables["stages"][0]) == {"ensemble", *limits}
+    assert not {"nose_hoover_links", "pressure_coupling", "most_iterations"} & set(tables["stages"][1])
+    assert not {"damping_per_A", "reaction_field_permittivity"} & set(tables["forces"])
+    assert build(Scene.read(tmp_path / "run" / "scene.toml")).scene.stages == build(ran).scene.stages
+
+
+@pytest.mark.parametrize("name", ["heavy_top_3", "water", "water_dimer"])
+def test_check_names_no_classes(name):
+    text = describe(Scene.read(ROOT / "systems" / f"{name}.toml"))
+    assert re.findall(r"\b[A-Z][a-z]+[A-Z]\w*", text) == []

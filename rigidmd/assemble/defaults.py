@@ -117,7 +117,7 @@ def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tup
     if method is None:
         has_charges = any(m.charges.any() for m in composition.species)
         method = (PERIODIC if composition.space.volume < inf else OPEN) if has_charges else "none"
-        faults += [f"forces.{message}" for message in forces.idle_keys(method)]
+        faults += [f"forces.{message}" for message in forces.idle_key_errors(method)]
     numbers: dict[str, Any] = {"electrostatics": method}
     if method == "reaction_field" and forces.reaction_field_truncation is None:
         like = forces.truncation in ("plain", "smooth_switch")

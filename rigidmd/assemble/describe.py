@@ -1,5 +1,6 @@
 """The report of `rigidmd check`: how a system would run, and what is not compiled for it."""
 
+import re
 from math import inf
 from typing import NamedTuple
 
@@ -65,8 +66,9 @@ def _describe_body(system: BodySystem) -> str:
         period = f": period {2 * np.pi / spin:.4g} s, {2 * np.pi / spin / run.timestep_s:.4g} steps" if spin else ""
         lines.append(f"  starts at phi theta psi = {angles} degrees, rotating at {spin:.6g} rad/s{period}")
     body = system.engine().model_for(system.method) if isinstance(system.method, Scheme) else system.body
-    lines.append(f"\ncompiled in: {', '.join(type(part).__name__ for part in body if part)}")
-    lines += [f"  {name.replace('_', ' ')}: {type(term).__name__}" for name, term in system.terms.items()]
+    parts = [words for part in body if part and not (words := _words(part)).startswith("no ")]
+    lines.append(f"\ncompiled in: {', '.join(parts)}")
+    lines += [f"  {name.replace('_', ' ')}: {_words(term)}" for name, term in system.terms.items()]
     lines += ["left out:", *(f"  {reason}" for reason in system.left_out)]
     how = f"{run.integrator}" + (f", {system.method.formulation}" if isinstance(system.method, Solver) else "")
     lines.append(f"\n{run.steps} steps of {run.timestep_s:g} s = {run.steps * run.timestep_s:g} s, {how}")
@@ -103,7 +105,7 @@ def _describe_molecules(system: System) -> str:
         pressure = system.tail.pressure(system.space.volume) / BAR
         lines.append(f"  tail correction: {energy:.4g} kJ/mol per molecule and {pressure:.4g} bar at this volume")
     if not isinstance(system.model.rotor, NoRotor):
-        lines.append(f"  rotation: {type(system.model.rotor).__name__}")
+        lines.append(f"  rotation: {_words(system.model.rotor)}")
     if system.thermostat is not None:
         lines.append(f"  thermostat: {name_of(system.thermostat)}, from Python, in every stage")
     for what in ("thermostat", "barostat")[system.thermostat is not None :]:
@@ -134,9 +136,14 @@ def describe_precision(system: System) -> str:
     return f"{system.scene.precision} precision, chosen because {system.precision_reason}"
 
 
+def _words(part: NamedTuple) -> str:
+    """The name of a class in words: "split rotor"."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()
+
+
 def _describe_term(system: System, term: NamedTuple) -> str:
     if not isinstance(term, PairForces):
-        return type(term).__name__
+        return _words(term)
     cutoff: float = term.potential.cutoff  # type: ignore[attr-defined]  # every pair potential has a cutoff
     reach = f"cutoff {cutoff:g} Å" if cutoff < inf else "no cutoff"
     if cutoff < inf and hasattr(term.potential, "truncation"):

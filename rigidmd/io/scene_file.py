@@ -11,7 +11,7 @@ import tomli_w
 from rigidmd.core.files import atomic_file, write_text
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import STRUCTURE
-from rigidmd.scene import Scene
+from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.models import LENNARD_JONES, MoleculeFile, Site
 
 
@@ -23,8 +23,12 @@ def input_names(scene: Scene) -> dict[str, str]:
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write the scene into the folder of a run, so that it can be run again."""
-    data = scene.model_dump(exclude_none=True)
+    """Write the scene into the folder of a run, so that it can be run again. Keys that do nothing are left out."""
+    data: Any = scene.model_dump(exclude_none=True)
+    if isinstance(scene, MolecularScene):
+        for section, table in [(scene.forces, data["forces"]), *zip(scene.stages, data["stages"], strict=True)]:
+            for key in section.idle_keys:
+                table.pop(key, None)
     for key, copied in input_names(scene).items():
         with atomic_file(folder / copied) as temporary:
             if key in scene.embedded_files:

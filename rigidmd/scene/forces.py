@@ -178,7 +178,7 @@ class Forces(Section):
     def _errors(self):
         if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
             yield f"switch_start_A would do nothing with truncation = {self.truncation!r}: add truncation = 'switch'"
-        yield from self.idle_keys(self.electrostatics or PERIODIC)
+        yield from self.idle_key_errors(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
@@ -187,15 +187,25 @@ class Forces(Section):
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
 
-    def idle_keys(self, method: str) -> Iterator[str]:
+    @property
+    def idle_keys(self) -> list[str]:
+        """The keys that do nothing with the method of electrostatics."""
+        return _idle_keys(self.electrostatics or PERIODIC)
+
+    def idle_key_errors(self, method: str) -> Iterator[str]:
         """Messages on keys that do nothing with a method of electrostatics."""
         default = "" if self.electrostatics else " (the default)"
-        for key in dict.fromkeys(key for other in ELECTROSTATICS.values() for key in other.keys):
-            idle = key not in ELECTROSTATICS[method].keys
-            if idle and getattr(self, key) != type(self).model_fields[key].default:
+        for key in _idle_keys(method):
+            if getattr(self, key) != type(self).model_fields[key].default:
                 yield f"{key} would do nothing with electrostatics = {method!r}{default}"
 
     @property
     def sets_k_vectors(self) -> bool:
         """Whether the scene sets the k-vectors of an Ewald sum."""
         return self.ewald_k_max is not None or self.ewald_k_radius_per_A is not None
+
+
+def _idle_keys(method: str) -> list[str]:
+    """Keys of [forces] that do nothing with a method of electrostatics."""
+    keys = dict.fromkeys(key for other in ELECTROSTATICS.values() for key in other.keys)
+    return [key for key in keys if key not in ELECTROSTATICS[method].keys]

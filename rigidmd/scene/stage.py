@@ -114,10 +114,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @field_validator("thermostat", "barostat", mode="before")
     @classmethod
-    def _is_available(cls, name: Any):
+    def _is_available(cls, name: Any, field: ValidationInfo):
         plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
         if plain in REFUSED:
-            raise ValueError(f"{REFUSED[plain]}. There are {', '.join((*THERMOSTATS, *BAROSTATS))}")
+            known = THERMOSTATS if field.field_name == "thermostat" else BAROSTATS
+            raise ValueError(f"{REFUSED[plain]}. The {field.field_name}s are {', '.join(known)}")
         return name
 
     @field_validator("duration_ps")
@@ -132,11 +133,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"an {self.ensemble} stage needs temperature_K"
         if self.has_barostat and self.pressure_bar is None:
             yield f"an {self.ensemble} stage needs pressure_bar"
-        parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
-        parts |= {CELL} if self.is_minimisation and self.changes_box else set()
-        given = {key: _users(key) for key in type(self).model_fields if self._is_given(key)}
-        if idle := {key: users for key, users in given.items() if users and users.isdisjoint(parts)}:
-            yield f"{', '.join(idle)} would do nothing {self._where(list(idle.values()))}"
+        if idle := [key for key in self.idle_keys if self._is_given(key)]:
+            yield f"{', '.join(idle)} would do nothing {self._where([_users(key) for key in idle])}"
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.changes_box:
@@ -145,13 +143,21 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield from self._barostat_errors()
         yield from self._rotor_errors()
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
-        yield from auto_errors(self.integrator, targets, [key for key in ("timestep_fs", "rotor") if key in given])
+        step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
+        yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
             yield f"duration_ps / timestep_fs is more than {MOST_STEPS:g} steps"
         if self.duration * 1000 < 0.5 * self.timestep_fs and not self.is_minimisation:
             yield f"duration_ps = {self.duration_ps:g} is less than one step of {self.timestep_fs:g} fs"
+
+    @property
+    def idle_keys(self) -> list[str]:
+        """The keys that do nothing in this stage."""
+        parts = {self.ensemble, self.thermostat_kind, self.barostat_kind}
+        parts |= {CELL} if self.is_minimisation and self.changes_box else set()
+        return [key for key in type(self).model_fields if (users := _users(key)) and users.isdisjoint(parts)]
 
     def _is_given(self, key: str) -> bool:
         return getattr(self, key) != type(self).model_fields[key].default
