@@ -53,7 +53,7 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("lengths_A = 20.0", "lengths_A = 17.0", ["cutoff_A = 9 (the default)", "half the shortest edge", "8.500 Å"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nperiodic = 1", ["box.periodic", "true or false"]),
         ("count = 20", "count = 0", ["molecules.0.count", "greater than 0"]),
-        ("count = 20", "count = 2.5", ["molecules.0.count", "whole number"]),
+        ("count = 20", "count = 2.5", ["molecules.0.count", "must be an integer"]),
         ("count = 20", "", ["molecules.0.count is missing"]),
         ('model = "spce"', 'model = "SPC-EE"', ["line 5", "molecules.0.model", "unknown model 'SPC-EE'", "did you mean spce?"]),
         ('model = "spce"', "", ["molecules.0", "one of model, file, sites"]),

@@ -412,7 +412,7 @@ def test_a_box_that_becomes_too_small_for_the_cut_off():
         ([stage_of(force_limit_kJ_mol_A=0.0)], {}, "force_limit_kJ_mol_A"),
         ([{"duration_ps": 1.0, "force_limit_kJ_mol_A": 0.2}], {}, "force_limit_kJ_mol_A would do nothing in an nve stage"),
         ([{"ensemble": "nve"}], {}, r"stages.0.duration_ps: is missing"),
-        ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage in which time passes is nve"),
+        ([stage_of(), {"duration_ps": 1.0}], {"start": {}}, "the first stage that is not a minimisation is nve"),
         ([stage_of(pressure_bar=1.0)], {"box": {"lengths_A": 20.0, "periodic": False}}, "box.periodic is false"),
         ([stage_of(pressure_bar=1.0)], {"molecules": [{"model": "spce", "count": 4, "frozen": "1"}]}, "frozen molecules do not move"),
         (

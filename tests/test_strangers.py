@@ -45,7 +45,7 @@ def own_molecule(position="[0.0, 0.0, 1.0]", more=""):
     ("old", "new", "expected"),
     [
         ("count = 20", f"count = {2**63}", "line 6: molecules.0.count: is a whole number of more than 64 bits"),
-        ("count = 20", "count = 1e30", "line 6: molecules.0.count: is 1e+30, must be a whole number"),
+        ("count = 20", "count = 1e30", "line 6: molecules.0.count: is 1e+30, must be an integer"),
         ("count = 20", f"count = {'9' * 5000}", "a whole number of more than 64 bits (at line 6, column 1)"),
         ("lengths_A = 20.0", f"lengths_A = 1{'0' * 400}", "line 2: box.lengths_A: is a whole number of more than 64 bits"),
         ("lengths_A = 20.0", "lengths_A = 1e-300", "line 2: box.lengths_A: is 1e-300, must be 0 or between 1e-30"),

@@ -76,7 +76,7 @@ def test_a_report_tells_of_molecules(water, tmp_path, capsys):
     assert cli.main(["report", str(water), "-o", str(page)]) == 0
     text = page.read_text("utf-8")
     assert is_alone(text)
-    for title in ("Means of each stage", "Plots", "Stability margins", "What was simulated", "What was left out, and why",
+    for title in ("Means of each stage", "Plots", "Stability margins", "System and interactions", "Not used, and why",
                   "Files", "How to repeat it"):  # fmt: skip
         assert f">{title}</h2>" in text
     record = read_record(water)
@@ -236,7 +236,7 @@ def test_a_film_moves(kind, request, tmp_path, capsys):
         places = red.argmax(axis=1)  # a red line in each plot, which moves to the right
         assert red.max(axis=1).min() > 0.3
         assert np.all(np.diff(places) > 5)
-    assert "0.3 s of film" in capsys.readouterr().out
+    assert "0.3 s of animation" in capsys.readouterr().out
 
 
 def test_a_film_needs_ffmpeg_for_mp4_only(top, tmp_path, monkeypatch, capsys):

@@ -233,7 +233,7 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
 
 
 def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
-    """The last stage of a run in which time passes, and which samples are of its production. Raises OutputError."""
+    """The last stage that is not a minimisation, and which samples are of its production. Raises OutputError."""
     stage, _, last, begin, shown = _last_stage(record.molecules, record.columns)
     time = record.columns["time"]
     return stage, shown & (time >= begin) & (time <= last)
@@ -286,8 +286,8 @@ def _without_rounding(time: np.ndarray) -> np.ndarray:
 
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
-    """The last stage with samples in which time passes, its begin, its end and where it is equilibrated, ps, and which
-    samples (l,) are of motion."""
+    """The last stage with samples that is not a minimisation, its begin, its end and where it is equilibrated, ps, and
+    which samples (l,) are of motion."""
     time, stages = columns["time"], system.scene.stages
     if all(stage.is_minimisation for stage in stages):
         raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")
@@ -298,4 +298,4 @@ def _last_stage(system: System, columns: dict[str, np.ndarray]):
             start = equilibrated_from({name: values[of_stage] for name, values in columns.items()}, stages[k])
             begin = time[of_stage[start]] if start or stages[k].volume else first
             return stages[k], float(first), float(time[of_stage[-1]]), float(begin), shown
-    raise OutputError("the run has not reached a stage in which time passes")
+    raise OutputError("the run has not reached a stage after its minimisations")

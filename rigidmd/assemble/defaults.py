@@ -101,8 +101,7 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
 
 
 def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> MolecularScene:
-    """A scene with the default of run.remove_momentum_interval_ps. Terms conserve the components keeps_momentum (3,) of
-    the total momentum."""
+    """A scene with the default of run.remove_momentum_interval_ps. keeps_momentum (3,) : conserved components."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
     removed = not ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum and keeps_momentum.any()
@@ -180,8 +179,7 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
 
 
 def body_with_defaults(scene: BodyScene, rotates: bool, radius: float) -> BodyScene:
-    """A scene of a single body with all defaults; rotates: the body has an orientation; radius: of the points in its
-    trajectory, m."""
+    """A scene of a single body with all defaults; rotates: it has an orientation; radius: of its trajectory, m."""
     run, watch = scene.run, scene.watch
     solver = run.integrator in SOLVERS
     if solver:

@@ -137,7 +137,7 @@ def describe_precision(system: System) -> str:
 
 
 def _words(part: NamedTuple) -> str:
-    """The name of a class in words: "split rotor"."""
+    """The name of a class as words: "split rotor"."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()
 
 

@@ -22,8 +22,7 @@ MOST_TRIES = 20_000
 MOST_DISTANCES = 1_000_000  # computed at once
 #: u; programs without massless sites give them a mass below this.
 NO_MASS = 0.1
-#: For the messages on the first molecules that do not fit, the best order of atoms is searched up to this multiple of
-#: the tolerance.
+#: Up to this multiple of the tolerance the best order of atoms is searched, for messages on molecules that do not fit.
 MOST_SEARCHED, SEARCH_TOLERANCE = 5, 3
 MOST_LISTED = 6  # atoms of a molecule in a message
 
@@ -229,7 +228,7 @@ def _match_groups(
         if any(c.nameless for c in candidates) and not faults:
             listed = ", ".join(name or "(no name)" for name in names)
             by_shape = species[found.species[members[0]]].name
-            found.notes.append(f"the names of atoms {listed} are no elements: assigned to {by_shape} by shape")
+            found.notes.append(f"the names of atoms {listed} are not elements: assigned to {by_shape} by shape")
     if faults:
         return [f"{described(m)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))

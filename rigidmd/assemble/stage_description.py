@@ -16,7 +16,7 @@ DISTRIBUTIONS = {
 
 
 def describe_stage(stage: Stage) -> list[str]:
-    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. Of a minimisation: the
+    """Two lines: steps, thermostat and barostat; sampled distribution and conserved quantities. For a minimisation: the
     minimised quantity; the limits of convergence."""
     if stage.is_minimisation:
         what, limits = "the potential energy", [f"forces of {stage.force_limit_kJ_mol_A:g} kJ/(mol Å)"]

@@ -95,7 +95,7 @@ def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | 
 
 
 def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
-    """The stages in which time passes with a given step: index, stage and temperature, K; 0 if it is not known."""
+    """The stages other than minimisations with a given step: index, stage and temperature, K; 0 if it is not known."""
     temperature = scene.start.temperature_K or 0.0
     for k, stage in enumerate(scene.stages):
         temperature = max(stage.temperatures) or temperature

@@ -147,8 +147,7 @@ def run_folder(output: str) -> tuple[Argument, Argument, Argument]:
 
 
 def file_about_run(options: Options, default: str, extensions: tuple[str, ...]) -> Path:
-    """The file to write. By default it is in the folder of the run, where it may be replaced; a new run removes it.
-    Raises OutputError."""
+    """The file to write, by default in the folder of the run, where it may be replaced. Raises OutputError."""
     from rigidmd.io.folder import add_to_folder, check_is_run
     from rigidmd.io.write import check_target
 

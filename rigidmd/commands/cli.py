@@ -34,8 +34,7 @@ OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allo
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 ended by a
-    signal."""
+    """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 signal."""
     from rigidmd.core.process import format_gigabytes, free_memory
 
     options = argparse.Namespace()

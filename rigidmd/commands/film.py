@@ -7,10 +7,10 @@ from rigidmd.commands.streams import progress_bar
 
 
 @command(
-    150, "write the film of a run as a file", "rigidmd film runs/water -o water.mp4 --plots",
+    150, "write an animation of a run as a file", "rigidmd film runs/water -o water.mp4 --plots",
     *run_folder(".mp4 (needs ffmpeg) or .gif (default: film.mp4 or film.gif in the folder of the run)"),
     argument("--seconds", type=number(float, 0.1, 3600, "a number of seconds from 0.1 to 3600"), metavar="S",
-        default=10.0, help="length of the film (default: 10)"),
+        default=10.0, help="length of the animation (default: 10)"),
     argument("--height", type=number(int, 100, 2160, "a number of pixels from 100 to 2160"), metavar="N",
         help="pixels (default: 640, of a .gif 448)"),
     argument("--plots", action="store_true", help="put plots with a moving cursor next to it"),

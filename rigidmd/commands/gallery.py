@@ -8,7 +8,7 @@ from rigidmd.commands.streams import announce
 
 
 @command(
-    160, "run shipped bodies and write a page with a picture of each, which leads to its film",
+    160, "run shipped bodies and write a page with a picture of each, which links to its animation",
     "rigidmd gallery heavy_top_3 intermediate_axis",
     argument("names", nargs="*", metavar="NAME", help="bodies of `rigidmd examples` (default: eleven)"),
     argument("-o", "--output", metavar="DIR", default="gallery", help="folder (default: gallery)"),

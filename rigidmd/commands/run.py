@@ -55,7 +55,7 @@ def run(options: Options) -> int:
         print(f"  `rigidmd resume {quoted}` continues it")
     else:
         more = "report` the page alone" if isinstance(scene, BodyScene) else f"analyse {quoted}` measures it"
-        print(f"  `rigidmd view {quoted}` shows its film on a page, `rigidmd {more}")
+        print(f"  `rigidmd view {quoted}` shows its animation on a page, `rigidmd {more}")
     if results.out_of_time:
         return OUT_OF_TIME
     return BY_SIGNAL + results.signal if results.signal else 0

@@ -17,8 +17,7 @@ PLAIN = 1e-6
 STEEPEST = 12
 #: Tolerance of forces with an Ewald sum, in estimated errors. Each engine has such an error.
 ERRORS = 5.0
-#: Tolerance of the energy of an Ewald sum per site, in (error of the force)/alpha. Measured: 0.003 (512 SPC/E, PME and
-#: PPPM at 1e-5).
+#: Tolerance of the energy of an Ewald sum per site, in (force error)/alpha. Measured: 0.003 (512 SPC/E, 1e-5).
 PER_SITE = 0.02
 
 

@@ -45,7 +45,7 @@ class System:
     freedom: DegreesOfFreedom
     constants: dict[str, float]  # constant energies, u Å²/ps²
     constant_pressure: float  # a constant part of the pressure, u/(Å ps²)
-    tail: Tail | None  # the tail correction, where the scene asks for it
+    tail: Tail | None  # the tail correction, where the scene requests it
     residue_number: np.ndarray  # (n,) numbers by which a scene may select molecules: see Molecules.frozen
     from_lattice: bool
     left_out: list[str]
@@ -117,7 +117,7 @@ class System:
 
     @property
     def last_freedom(self) -> DegreesOfFreedom:
-        """Degrees of freedom in the last stage in which time passes."""
+        """Degrees of freedom in the last stage that is not a minimisation."""
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         return self.freedom_in(moving[-1]) if moving else self.freedom
 
@@ -147,7 +147,7 @@ class System:
 
     @property
     def precision(self) -> Precision:
-        """Of forces; a resolved scene has no "auto"."""
+        """Precision of forces; a resolved scene has no "auto"."""
         return cast(Precision, self.scene.precision)
 
     def engine(self) -> CpuEngine:

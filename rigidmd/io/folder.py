@@ -75,8 +75,7 @@ def make_folder(folder: Path, names: Iterable[str], lock: "FolderLock") -> None:
 
 
 def continue_folder(folder: Path, names: Iterable[str]) -> None:
-    """Resume in the folder of a run that will also write these files. Its summary is outdated and removed. Raises
-    OutputError."""
+    """Resume in the folder of a run that will also write these files; removes its old summary. Raises OutputError."""
     add_to_folder(folder, names)
     with writing(folder):
         (folder / SUMMARY).unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """The JSON and CSV files of runs: writers of log.csv and pressure_tensor.csv, and readers of all of them.
 
-Files may be from strangers, so sizes are limited and data validated. Written lines are soon on the disk, so that a
+Files are untrusted input, so sizes are limited and data validated. Written lines are soon on the disk, so that a
 killed run keeps its samples. The first columns of log.csv are the same as in OpenMM's StateDataReporter.
 """
 

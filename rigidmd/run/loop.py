@@ -75,7 +75,7 @@ class RunLoop:
 
     @property
     def is_running(self) -> bool:
-        """Whether the run advances now: an observer may ask."""
+        """Whether the run advances now: an observer may check."""
         return getgeneratorstate(self._course) == GEN_RUNNING
 
     @property

@@ -385,7 +385,7 @@ class MolecularRun(RunPart):
     @property
     def headline(self) -> str:
         system, asked = self.system, self.scene.threads or 0
-        more = f" (the scene asks for {asked}; this machine has no more)" if asked > self.threads else ""
+        more = f" (the scene requests {asked}; this machine has no more)" if asked > self.threads else ""
         return (
             f"{self.scene.name}: {len(system.model.species)} molecules, {system.site_count} sites, "
             f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"

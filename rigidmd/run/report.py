@@ -116,7 +116,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         if stage["temperature_rotation_K"] is not None:
             rows.append(("", _temperatures(stage, "")))
         if parts := _temperatures(stage, "_unbiased"):
-            rows.append(("", f"{parts} without the error of the time step"))
+            rows.append(("", f"{parts} corrected for the time step"))
         if (scatter := stage.get("temperature_scatter_K")) is not None:
             off, before = stage["temperature_K"] - stage["temperature_before_K"], stage["temperature_before_K"]
             moment = "this stage keeps the energy of one moment; such temperatures scatter by"
@@ -147,7 +147,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
                 total += f", {stage['drift_over_kinetic_std']:+.2g} standard deviations of the kinetic energy"
             rows.append(("", total))
         noise = stage["energy_rms_kJ_mol_per_molecule"]
-        rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms about the line"))
+        rows.append(("energy noise", f"{noise:.2g} kJ/mol per molecule, rms deviation from the linear fit"))
     return rows
 
 

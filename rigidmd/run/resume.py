@@ -172,8 +172,7 @@ def stored(owner: object, types: Mapping[str, Any]) -> Checkpoint:
 
 
 def restored(kept: Checkpoint, types: Mapping[str, Any], rows: Mapping[str, Scheme] | None = None) -> dict[str, Any]:
-    """The attributes that `stored` has written, validated. rows : custom integrators, see `Scene.rows`. Raises
-    ValueError or KeyError."""
+    """The attributes of `stored`, validated. rows : see `Scene.rows`. Raises ValueError or KeyError."""
     arrays: dict[str, Any] = {name: kept.arrays[name] for name, kind in types.items() if kind is np.ndarray}
     for name in (name for name, kind in types.items() if kind == Arrays):
         start = f"{name}/"

@@ -176,13 +176,11 @@ class Simulation(Displayed):
         self._molecules().start_from(state)
 
     def start(self) -> "OverlapRemoval | None":
-        """Go to the state of molecules before the first step, from which `run` starts. Returns the removal of
-        overlaps."""
+        """Go to the state before the first step, from which `run` starts. Returns the removal of overlaps."""
         return self._molecules().start()
 
     def settle(self) -> State:
-        """Go to the state of molecules after removal of overlaps and the minimisations that come first, from which time
-        passes."""
+        """Go to the state of molecules after removal of overlaps and the minimisations that come first."""
         return self._molecules().settle()
 
     def atoms(self) -> "ase.Atoms":

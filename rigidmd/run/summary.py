@@ -59,7 +59,7 @@ class Minimum(NamedTuple):
     force: float  # largest force on a molecule that is not frozen
     torque: float  # largest torque about a principal axis
     pressure: tuple[float, ...] | None  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
-    deviation: float | None  # largest deviation from the pressure asked for; None if the cell does not relax
+    deviation: float | None  # largest deviation from the requested pressure; None if the cell does not relax
 
 
 def summarise(

@@ -33,8 +33,7 @@ AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
 
 class Scene(Section, Displayed):
-    """The complete description of a run: a `BodyScene` if it has a table [body], else a `MolecularScene`. Read one with
-    `Scene.read(path)`."""
+    """The description of a run, read by `Scene.read(path)`: a `BodyScene` if it has [body], else a `MolecularScene`."""
 
     name: Annotated[str, Field(pattern=r"^[\w][\w.\-]*$", max_length=LONGEST_NAME)] = "scene"
     """Name of the run; default: the name of the file"""

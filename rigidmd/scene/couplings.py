@@ -28,12 +28,12 @@ class Coupling(NamedTuple):
     source: str
     keys: dict[str, float | Callable[[Any], float]]  # its keys -> their defaults, or functions of the stage
     ensembles: tuple[str, ...] = ("nvt", "npt")
-    #: Of a thermostat: whether it acts on each molecule by itself, so that the total momentum is not conserved and
+    #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is not conserved and
     #: diffusion and spectra change; its time constant (ps) and its description by the values of its keys.
     on_molecules: bool = False
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
-    #: Of a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
+    #: For a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
     #: integrator then has to consist; its name in reports, if it is another one.
     shapes: tuple[str, ...] = get_args(Shapes)
     in_verlet_steps: bool = False

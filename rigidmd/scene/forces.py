@@ -39,7 +39,7 @@ ELECTROSTATICS = {
 #: Defaults of `electrostatics` where sites have charges, in a periodic box and in an open one.
 PERIODIC, OPEN = "pme", "coulomb"
 #: Pair potentials that are not of charges: key of `Forces`, which also names the term and the module in
-#: `forces.potentials` with the function `interactions` -> its name in the list of what a scene leaves out, and why.
+#: `forces.potentials` with the function `interactions` -> its name among the unused interactions, and why.
 POTENTIALS = {"lennard_jones": ("Lennard-Jones", "lennard_jones is false")}
 
 
@@ -148,30 +148,30 @@ class Forces(Section):
     damping_per_A: Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)] = 0.2
     """Damping of damped_shifted_force; 0 for none"""
     ewald_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
-    """Of ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets the
-    keys below; default: 5e-5, somewhat better than the defaults of GROMACS and OpenMM"""
+    """With ewald and pme: rms error of the force on a site, relative to the force between two charges e at 1 Å; sets
+    the keys below; default: 5e-5, somewhat better than the defaults of GROMACS and OpenMM"""
     ewald_cutoff_A: Positive | None = None
-    """Of ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a step fastest, by a model
-    of its cost, else cutoff_A"""
+    """With ewald and pme: cutoff of the real-space part. Default: with pme the one that makes a step fastest, by a
+    model of its cost, else cutoff_A"""
     ewald_alpha_per_A: Positive | None = None
     """Splitting parameter: charges are screened by erfc(alpha r)"""
     ewald_k_max: KIndex | tuple[KIndex, KIndex, KIndex] | None = None
-    """Of ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or file"""
+    """With ewald: largest |n| of k = 2 pi n/L, one for all axes or one each, for the cell of box or file"""
     ewald_k2_max: Count | None = None
-    """Of ewald: also largest n_x² + n_y² + n_z²"""
+    """With ewald: also largest n_x² + n_y² + n_z²"""
     ewald_k_radius_per_A: Positive | None = None
-    """Of ewald: largest length of k"""
+    """With ewald: largest length of k"""
     ewald_truncation: Literal["plain", "shift"] | None = None
-    """Of ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cutoff, forces are the
+    """With ewald and pme: whether the real-space energy erfc(alpha r)/r is shifted to 0 at the cutoff, forces are the
     same. Default: plain if `truncation` is plain, else shift. With shift, coulomb_self also includes
     -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0 for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
-    """Of pme: order of the B-splines; 4 is cubic"""
+    """With pme: order of the B-splines; 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
-    """Of pme: grid points along each edge of the cell of box or file; three equal numbers if its tilt is more than half
-    an edge, because an equivalent cell then replaces it"""
+    """With pme: grid points along each edge of the cell of box or file; three equal numbers if its tilt is more than
+    half an edge, because an equivalent cell then replaces it"""
     skin_A: Annotated[float, Strict(), Field(gt=0, le=100)] = 1.9
     """Extra radius of the neighbour list; affects only the speed"""
 

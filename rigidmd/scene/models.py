@@ -19,8 +19,7 @@ from rigidmd.scene.validation import (
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
 
 MODELS = Path(__file__).parent.parent / "models"
-#: Smallest and largest absolute value of numbers of molecules other than 0, in Å, u, e, kJ/mol, ps: products of a few
-#: are finite.
+#: Smallest and largest absolute value of numbers of molecules other than 0: products of a few are finite.
 SIZES = (1e-30, 1e30)
 #: Largest number of sites of a molecule.
 MOST_SITES = 5000

@@ -274,7 +274,7 @@ class MolecularScene(Scene):
             yield "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
         first, from_file = self.first_moving, self.structure is not None and self.structure.velocities
         if self.start.temperature_K is None and first is not None and first.temperature_K is None and not from_file:
-            which = "the first stage" if first is self.stages[0] else "the first stage in which time passes"
+            which = "the first stage" if first is self.stages[0] else "the first stage that is not a minimisation"
             yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
         if self.start.temperature_K is not None and from_file:
             yield "start.temperature_K would do nothing: the velocities are read from the structure file"

@@ -176,4 +176,4 @@ class Start(Section):
     """Momenta at the start."""
 
     temperature_K: NonNegative | None = None
-    """Temperature at which momenta are drawn; default: the temperature of the first stage in which time passes"""
+    """Temperature at which momenta are drawn; default: the temperature of the first stage that is not a minimisation"""

@@ -17,27 +17,20 @@ MOST_STEPS = 1e12
 
 Ensemble = Literal["nve", "nvt", "npt", "nph", "minimise"]
 
-#: Ensembles in which time passes.
+#: Ensembles of stages that are not minimisations.
 MOVING = {"nve", "nvt", "npt", "nph"}
 #: Stands in USED for a minimisation in which the cell relaxes.
 CELL = "minimise with a cell"
 #: Key -> the ensembles that use it; keys of thermostats and barostats are in their tables.
 USED = {
-    "duration_ps": MOVING,
-    "timestep_fs": MOVING,
-    "integrator": MOVING,
-    "rotor": MOVING,
+    **dict.fromkeys(("duration_ps", "timestep_fs", "integrator", "rotor"), MOVING),
+    **{key: {"minimise"} for key in ("force_limit_kJ_mol_A", "torque_limit_kJ_mol", "most_iterations")},
+    **{key: {"npt", "nph"} for key in ("barostat", "compressibility_per_bar")},
+    **{key: {"nvt", "npt"} for key in ("temperature_K", "thermostat")},
     "volume": {"nve", "nvt"},
-    "temperature_K": {"nvt", "npt"},
-    "thermostat": {"nvt", "npt"},
     "pressure_bar": {"npt", "nph", "minimise"},
     "pressure_coupling": {"npt", "nph", CELL},
-    "barostat": {"npt", "nph"},
-    "compressibility_per_bar": {"npt", "nph"},
-    "force_limit_kJ_mol_A": {"minimise"},
-    "torque_limit_kJ_mol": {"minimise"},
     "pressure_limit_bar": {CELL},
-    "most_iterations": {"minimise"},
 }
 
 #: Keys of errors for which integrator = "auto" chooses the integrator and the step.

@@ -12,15 +12,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    Strict,
-    ValidationError,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, ValidationInfo, model_validator
 from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.toml import line_of, shorten_repr, shorten_text
@@ -175,8 +167,7 @@ SENTENCES = {
     "less_than_equal": "is {shown}, must not be more than {le:g}",
     "finite_number": "is {shown}, must be a finite number",
     "float_type": "is {shown}, must be a number",
-    "int_type": "is {shown}, must be a whole number",
-    "int_from_float": "is {shown}, must be a whole number",
+    **dict.fromkeys(("int_type", "int_from_float"), "is {shown}, must be an integer"),
     "bool_type": "is {shown}, must be true or false",
     "string_type": "is {shown}, must be a text in quotes",
     **dict.fromkeys(("tuple_type", "list_type"), "is {shown}, must be a list"),
@@ -193,7 +184,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case "extra_forbidden":
             known, name = _known_keys(model, keys[:-1]), str(keys[-1])
             with_unit = any(re.fullmatch(f"{re.escape(name)}_[a-zA-Z0-9_]+", key) for key in known)
-            listed = f"; known here: {', '.join(known)}" if known else ""
+            listed = f"; there are {', '.join(known)}" if known else ""
             return "unknown key" + ((not with_unit and _foreign(name, model)) or did_you_mean(name, known) or listed)
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"

@@ -165,8 +165,7 @@ def _rows_by_value(values: list[str]) -> dict[tuple[str, int], int]:
 
 
 def last_bits(first: str, second: str) -> int | None:
-    """Number of the last bits of two numbers that differ: bits of the count of floats between them, at most 53. None
-    for text."""
+    """Number of last bits that differ: bits of the count of floats between two numbers, at most 53; None for text."""
     try:
         numbers = np.array([float(first), float(second)]).view(np.int64)
     except ValueError:

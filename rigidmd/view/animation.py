@@ -97,7 +97,7 @@ def write_film(
                     progress((k + 1) / count)
         except (RuntimeError, ValueError) as error:
             raise OutputError(f"{path} cannot be written: {error}") from None
-    return path, [*notes, f"{seconds:g} s of film: {(end - begin) / seconds:.3g} {record.time_unit} per second"]
+    return path, [*notes, f"{seconds:g} s of animation: {(end - begin) / seconds:.3g} {record.time_unit} per second"]
 
 
 def _draw_panels(figure, record: Record, left: float) -> list[tuple[Any, Any]]:

@@ -179,7 +179,7 @@ class BodyAnimation:
         axes.text(*label, name, color=color, **style)
 
     def loop_end(self) -> tuple[float, list[str]]:
-        """End of a film, and a note: the last return of the motion to its start, to repeat it without a jump."""
+        """End of an animation, and a note: the last return of the motion to its start, to repeat it without a jump."""
         dots = np.abs(self.quaternion @ self.quaternion[0]).clip(0, 1)
         away = [2 * np.arccos(dots) / RETURN_ANGLE]
         for values in (*self.vectors.values(), self.position):
@@ -193,7 +193,7 @@ class BodyAnimation:
             return float(self.time[-1]), []
         near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]  # the best of the last returns
         end = float(self.time[near[off[near].argmin()]])
-        return end, [f"The motion returns to its start at {end:.6g} s, where the film ends."]
+        return end, [f"The motion returns to its start at {end:.6g} s, where the animation ends."]
 
     def film_notes(self, interval: float, seconds: float) -> list[str]:
         """A sentence if the body rotates too far between frames for its rotation to be seen."""

@@ -35,7 +35,7 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(system: BodySystem) -> Mesh:
-    """The surface of a body: as the scene asks for, its solid, its points joined, or a body of equal inertia."""
+    """The surface of a body: as the scene requests, its solid, its points joined, or a body of equal inertia."""
     table, scene = system.scene.body, system.scene
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as

@@ -105,7 +105,7 @@ class MoleculeAnimation:
         self._low, self._high = (low + high) / 2 - half, (low + high) / 2 + half
 
     def loop_end(self) -> tuple[float, list[str]]:
-        """End of a film, and notes."""
+        """End of an animation, and notes."""
         return float(self.time[-1]), []
 
     def film_notes(self, interval: float, seconds: float) -> list[str]:

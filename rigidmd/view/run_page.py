@@ -86,8 +86,8 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     lines = describe(record.scene, user_code=False).splitlines()  # the output of `rigidmd check`
     start = lines.index("left out:") if "left out:" in lines else len(lines)
     end = next((k for k in range(start + 1, len(lines)) if not lines[k].startswith("  ")), len(lines))
-    yield section("What was simulated", code("\n".join([*lines[:start], *lines[end:]])))
-    yield section("What was left out, and why", items(line.strip() for line in lines[start + 1 : end]))
+    yield section("System and interactions", code("\n".join([*lines[:start], *lines[end:]])))
+    yield section("Not used, and why", items(line.strip() for line in lines[start + 1 : end]))
     yield section("Files", _files(record))
     yield section("How to repeat it", *_repeat(record))
 
@@ -156,7 +156,7 @@ def _analyses(record: Record) -> Iterator[str]:
     yield f'<p class="faint">Values ± one standard error, of {html.escape(text)}.</p>' if text else ""
     yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
-    yield "<p>Left out:</p>" + items(left_out) if left_out else ""
+    yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
 
 
 def _number(value: float | None) -> str:
@@ -255,7 +255,7 @@ def write_view(folder: Path, path: Path) -> tuple[Path, list[str]]:
     record = read_record(folder)
     animation = animation_of(record)
     first, *others = animation_parts(record, animation)
-    write_text(path, page(f"{record.scene.name}: the film of a run", [*parts(record, first), *others], FILM_STYLE))
+    write_text(path, page(f"{record.scene.name}: the animation of a run", [*parts(record, first), *others], FILM_STYLE))
     return path, [*record.missing, *animation.notes]
 
 

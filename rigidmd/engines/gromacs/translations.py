@@ -10,8 +10,7 @@ from rigidmd.scene.models import Molecule
 
 
 def gromacs_points(molecule: Molecule) -> MassPoints:
-    """The mass points of a molecule. Three points are adjacent, and the first is the apex of an isosceles triangle, as
-    SETTLE needs it."""
+    """The mass points of a molecule. The first of three is the apex of an isosceles triangle, as SETTLE needs it."""
     body = mass_points(molecule)
     if len(body.mass) != 3 or (body.site < 0).all():
         return body

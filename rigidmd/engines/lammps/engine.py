@@ -202,8 +202,7 @@ class Process:
         self._end = weakref.finalize(self, _ended, self._process, [self._in, self._out], self._folder_handle)
 
     def run_commands(self, *lines: str) -> list[float]:
-        """Send commands, and return the numbers that LAMMPS prints last. Raises SimulationError if it stops during a
-        run, else EngineError."""
+        """Send commands; return the last numbers printed. Raises SimulationError in a run, else EngineError."""
         prints_numbers = lines[-1].startswith(f'print "{NUMBERS}')
         text = "\n".join([*lines, *([] if prints_numbers else [f'print "{NUMBERS}"'])])
         with contextlib.suppress(OSError):  # it has ended; its output shows why

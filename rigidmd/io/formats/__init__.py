@@ -104,7 +104,7 @@ def extensions(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
 
 
 def written(wanted: Callable[[Format], Any]) -> tuple[str, ...]:
-    """Of each of these formats only the extension that is written."""
+    """For each of these formats only the extension that is written."""
     return tuple(name for name in extensions(wanted) if name == BY_EXTENSION[name].extensions[0])
 
 

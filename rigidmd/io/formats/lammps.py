@@ -119,8 +119,7 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
 
 
 def _columns(path: Path, style: str, rows: list[Row], known: set[str]) -> dict[str, int]:
-    """The columns of the atoms: by the style or the names of columns after Atoms, else by the only style that fits.
-    Raises StructureError."""
+    """The columns of the atoms: by style or names after Atoms, else the only style that fits. Raises StructureError."""
     words = [COLUMN.get(word, word) for word in re.split(r"[\s,]+", style.lower())]
     width, line, basic = len(rows[0].words), rows[0].line, STYLES["atomic"]
     if words[0] == "hybrid":
@@ -281,8 +280,7 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
 
 
 def dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
-    """The origin (3,) and the cell (3, 3) of a dump, whose bounds enclose the cell by an upright box. kinds : the words
-    after BOX BOUNDS"""
+    """Origin (3,) and cell (3, 3) of a dump, whose bounds enclose the cell. kinds : the words after BOX BOUNDS"""
     bounds, general = table(path, rows, "the bounds of the box"), kinds[:1] == ["abc"]
     if bounds.shape not in ([(3, 4)] if general else [(3, 2), (3, 3)]):
         raise unexpected(path, rows[0][0], "the bounds of the box along x", " ".join(rows[0][1]))

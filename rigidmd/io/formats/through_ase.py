@@ -45,7 +45,7 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
         known = " ".join(extensions(lambda form: form.read or form.read_packed))
-        raise structure_error(path, f"its format is unknown to ASE; known here are {known}") from None
+        raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
         reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
         hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"

@@ -112,8 +112,7 @@ def read_in_process(
 
 
 def main() -> None:
-    """The program of the process: its arguments are a pickled function, its arguments, and the file for the arrays, or
-    for `error`, a message."""
+    """The program of the process: a pickled function, its arguments, the file for the arrays or the message `error`."""
     read, path, frame, atoms, target = sys.argv[1:]
     warnings.simplefilter("ignore")
     try:

@@ -79,8 +79,7 @@ def _residues(atoms) -> list[tuple] | None:
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:
-    """Columns of the species and of the positions, or None, and the number of columns: 0, 1 and 4 for
-    `species:S:1:pos:R:3`."""
+    """Columns of species and positions, or None, and their number: 0, 1 and 4 for `species:S:1:pos:R:3`."""
     words, column, found = properties.split(":"), 0, {}
     for name, _, width in zip(words[::3], words[1::3], words[2::3], strict=False):
         found["species" if name.lower() == "symbols" else name.lower()] = column

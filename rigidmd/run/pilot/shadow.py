@@ -74,7 +74,7 @@ def choose_for_averages(system: System, state: State, k: int) -> tuple[Stage, st
     step = steps[best] * FEMTOSECOND
     bias = ALLOWANCE[best] * bias_of_potential(best, rate, step)
     return _decided(stage, best, steps[best]), (
-        f"bias of U below about {bias:.1e} kT per degree of freedom, where {target:g} was asked for: estimated from "
+        f"bias of U below about {bias:.1e} kT per degree of freedom, where {target:g} was requested: estimated from "
         f"{sqrt(rate):.3g} rad/ps, the rms frequency of the motions, {BASIS[best]}, not sampled; "
         f"{1 / step:.4g} forces per ps"
     )

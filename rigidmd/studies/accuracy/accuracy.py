@@ -20,8 +20,7 @@ from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
 from rigidmd.view.page import chips, code, items, page, section, table, wide, write_page
 
-#: Default integrators besides those of [[integrators]]: velocity Verlet, the best of each kind, and for a body the
-#: textbook solvers.
+#: Default integrators: velocity Verlet, the best of each kind, those of [[integrators]]; for a body also solvers.
 DEFAULT_INTEGRATORS = (
     *(name for name, scheme in SCHEMES.items() if scheme.is_default),
     *(name for name, (solver, _) in COMPARATORS.items() if solver != RADAU),
@@ -103,7 +102,7 @@ def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSyste
     """The system, and the scene's time step per force evaluation (fs)."""
     last = scene.stages[-1]
     if last.is_minimisation:
-        raise SceneError(scene.source, ["the last stage is a minimisation: accuracy needs one in which time passes"])
+        raise SceneError(scene.source, ["the last stage is a minimisation: accuracy needs another stage at the end"])
     simulation, state = start_of_last_stage(scene)
     trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
     trial_system.rounding = single_precision_errors(simulation.system, state)

@@ -1,1 +1,1 @@
-"""`rigidmd stability`: a battery of cases that try to break the engine, each a scene made in code."""
+"""`rigidmd stability`: a test suite of extreme cases for the engine, each a scene made in code."""

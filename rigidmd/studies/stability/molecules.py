@@ -97,8 +97,8 @@ def overlaps(result: CaseResult, quick: bool) -> None:
             reported_error = energy_error(results, results["potential"][0])
             return Outcome(reported_error, reported_error)
 
-        result.add("let go at 0.5 sigma", at(0.005), 1e-2, family, 0.005)
-        result.limits.append(longest_step(at, 0.005, "let go at 0.5 sigma", family))
+        result.add("released at 0.5 sigma", at(0.005), 1e-2, family, 0.005)
+        result.limits.append(longest_step(at, 0.005, "released at 0.5 sigma", family))
 
 
 @attempt

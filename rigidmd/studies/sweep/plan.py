@@ -153,7 +153,7 @@ def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, 
         raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
     seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
-        raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be a whole number"])
+        raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be an integer"])
     return [*(axis for axis in axes if axis not in with_seed), Axis((SEED,), tuple(range(seed, seed + replicas)))]
 
 

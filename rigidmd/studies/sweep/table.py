@@ -141,8 +141,7 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
-    """Results of a run: for molecules means over the production of its last stage, for a body figures of its motion.
-    Raises OutputError."""
+    """Results of a run: means over the production of molecules, figures of the motion of a body. Raises OutputError."""
     if record.is_body:
         return _summarise_motion(record)
     _, production = production_samples(record)
