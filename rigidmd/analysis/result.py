@@ -130,8 +130,7 @@ def converged_value(
 
 
 def with_block_error(frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]) -> Measured:
-    """An array computed from frames, and its standard error from blocks of them, of at least two frames, without the
-    first ones if they do not divide."""
+    """An array computed from frames, and its standard error from blocks of at least two of them."""
     whole, size = np.asarray(function(frames), float), len(frames) // BLOCKS
     blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
     parts = [np.asarray(function(frames[k : k + size]), float) for k in blocks]

@@ -286,8 +286,7 @@ def _without_rounding(time: np.ndarray) -> np.ndarray:
 
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):
-    """The last stage with samples that is not a minimisation, its begin, its end and where it is equilibrated, ps, and
-    which samples (l,) are of motion."""
+    """The last moving stage with samples, its begin, end and equilibrated part, ps, and its samples of motion (l,)."""
     time, stages = columns["time"], system.scene.stages
     if all(stage.is_minimisation for stage in stages):
         raise OutputError("this run is a minimisation, in which no time passes: there is nothing to average")

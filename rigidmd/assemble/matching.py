@@ -158,8 +158,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
-    """Groups of atoms with mass, in file order, connected by bonds as long as the bonds of the templates, which are the
-    edges of their minimum spanning trees."""
+    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
     from scipy.spatial.distance import cdist

@@ -1,5 +1,4 @@
-"""The species of a scene: their rigid molecules, and which molecules are frozen. Models from the geometry of a molecule
-and a table of parameters."""
+"""The species of a scene: their rigid molecules, frozen ones, models from a geometry and a table of parameters."""
 
 # isort: skip_file
 from collections import Counter

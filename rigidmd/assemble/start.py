@@ -96,8 +96,7 @@ def set_momenta(scene: MolecularScene, model: Model, state: State, start: Config
 def _start_lattice(
     scene: MolecularScene, species: list[Molecule], n: int, edges: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """n points (n, 3), drawn at random from a nearly cubic lattice in a rectangular box with edges (3,), at a distance
-    from the walls. Raises SceneError."""
+    """n random points (n, 3) of a nearly cubic lattice in a box with edges (3,), off the walls. Raises SceneError."""
     low, high, faults = np.zeros(3), edges.copy(), []
     for axis, name in enumerate(AXES):
         across = [walls for walls in scene.fields.walls if walls.direction == axis]

@@ -80,8 +80,7 @@ def _limits(limits: tuple[Limit, ...], subject: Any) -> Iterator[str]:
 
 
 def checked_view(system: System, program: Program, where: str, more: Iterable[str] = ()) -> ForceFieldView:
-    """The view of a system for an external engine. Raises SceneError with all that the engine lacks, and `more`
-    messages; `where` begins each."""
+    """The view of a system for an external engine. Raises SceneError with all it lacks, and `more`, after `where`."""
     view = force_field_of(system)
     if found := [*program.load(program.translations).refusals(view), *more]:
         raise SceneError(system.scene.source, [f"{where}: {message}" for message in found])
@@ -110,8 +109,7 @@ SPLIT = {None: "", "split": ""}
 
 
 class ExternalEngine(Engine, ABC):
-    """Base of the engines that run another program. A stage of the scene determines the motion. The first tally of
-    `evaluate` has the virial of all terms."""
+    """Base of engines that run another program for one stage. The first tally of `evaluate` has the whole virial."""
 
     def __init__(self, system: System, stage: int):
         self._system, self._view, self._stage = system, force_field_of(system), system.scene.stages[stage]
@@ -164,8 +162,7 @@ def same_state(one: State | None, other: State) -> bool:
 
 
 def external_engine(system: System, stage: int = 0) -> ExternalEngine:
-    """The external engine of a scene, for one of its stages. Raises SceneError with all features that it lacks, and
-    EngineError if it is not installed."""
+    """The external engine for a stage. Raises SceneError with all that it lacks; EngineError if not installed."""
     program = _supporting_program(system)
     return program.load(program.engine)(system, stage, **system.scene.engine.options)
 

@@ -173,8 +173,7 @@ class MassPoints(NamedTuple):
 
 
 def mass_points(molecule: Molecule, frozen: bool = False, sites: bool = True) -> MassPoints:
-    """The mass points of a molecule; all its sites if it is frozen. `sites`: whether sites may be the points if just
-    enough of them have mass."""
+    """The mass points of a molecule; all sites of a frozen one. `sites`: they may be sites, if enough have mass."""
     if frozen:
         return MassPoints(molecule.masses, molecule.positions_body, np.arange(len(molecule.masses)), {})
     mass, position, site = _points(molecule, sites)

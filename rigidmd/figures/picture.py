@@ -16,9 +16,7 @@ DPI = 80
 
 class Picture(Figure):
     """A figure of Matplotlib that is not known to pyplot, so that a notebook shows it once, as the value of its cell.
-
-    Texts are not parsed as formulas, as names of users may contain dollar signs; numbers at ticks are.
-    """
+    Texts are not parsed as formulas, as names of users may contain dollar signs; numbers at ticks are."""
 
     def draw(self, renderer) -> None:
         self._take_texts_as_written()

@@ -34,10 +34,8 @@ def curve_style(k: int) -> dict:
 
 
 class InPieces:
-    """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous one.
-
-    The pieces of Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two sides of the path.
-    """
+    """A path effect of Matplotlib that draws a path in pieces, each from the end of the previous one. The pieces of
+    Matplotlib, `agg.path.chunksize`, omit the last point of each, and thus two sides of the path."""
 
     def draw_path(self, renderer, gc, path, affine, rgbFace=None):
         sides = len(path.vertices) - 1

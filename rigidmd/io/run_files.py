@@ -80,8 +80,7 @@ class Summary(BaseModel):
 
 
 def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
-    """The validated content of a JSON file; None without a file. Raises OutputError with file and field, and `remedy`,
-    the advice for a damaged file."""
+    """The validated JSON file, or None. Raises OutputError with file and field, and `remedy` for a damaged file."""
     if not _is_there(path, LARGEST_JSON):
         return None
     try:

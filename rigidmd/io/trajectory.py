@@ -277,8 +277,7 @@ def open_trajectory(
 
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
-    """Write names, molecules and first positions, which viewers need next to a trajectory. Raises SimulationError if
-    the format cannot hold a position."""
+    """Write names, molecules and first positions for viewers. Raises SimulationError if the format cannot hold one."""
     _check_fits(path, system.site_positions(state, wrapped))
     with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
         write = not_none(BY_EXTENSION[path.suffix].write_topology)

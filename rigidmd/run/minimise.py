@@ -193,9 +193,7 @@ class Enthalpy:
 
     def largest(self, point: EnthalpyPoint) -> tuple[float, float, float]:
         """Largest force (u Å/ps²), torque about a principal axis (u Å²/ps²) and deviation of the pressure (u/(Å ps²)).
-
-        Pressures are averaged over the components that share a coordinate; 0 if the cell does not relax.
-        """
+        Pressures are averaged over the components that share a coordinate; 0 if the cell does not relax."""
         force = np.linalg.norm(point.load.force[self.free], axis=1).max(initial=0.0)
         torque = np.abs(point.load.torque_body * self.rotates).max(initial=0.0)
         off = [abs(np.mean((point.pressure - self.target)[self.coordinate == c])) for c in range(len(self._lengths))]

@@ -101,10 +101,8 @@ Arrays = dict[str, np.ndarray]
 
 
 def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[str, str], steps: int) -> None:
-    """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after some steps.
-
-    The last stage of molecules may be longer or shorter than before, but not shorter than it has run.
-    """
+    """Raise CheckpointError unless a resolved scene can continue a run of the scene `before` after some steps. The last
+    stage of molecules may be longer or shorter than before, but not shorter than it has run."""
     excluded = [*scene.inputs, *scene.embedded_files, *NOT_COMPARED]
     if isinstance(scene, MolecularScene) and not scene.stages[-1].ramps:
         excluded.append(f"stages.{len(scene.stages) - 1}.duration_ps")

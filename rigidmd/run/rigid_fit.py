@@ -27,9 +27,7 @@ class RigidFit:
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
         """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.
-
-        Q of a linear molecule has an arbitrary rotation about its axis.
-        """
+        Q of a linear molecule has an arbitrary rotation about its axis."""
         centre = np.empty((self._n, 3))
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
         velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))
@@ -58,10 +56,8 @@ class RigidFit:
 
 
 class _Template:
-    """The sites of a molecule in its body frame, which extend in r dimensions.
-
-    middle (3,) : mean of the sites; weights (s, r), columns (r, 3) : of the singular value decomposition
-    """
+    """The sites of a molecule in its body frame, which extend in r dimensions. middle (3,) : mean of the sites; weights
+    (s, r), columns (r, 3) : of the singular value decomposition"""
 
     def __init__(self, molecule: Molecule):
         body = molecule.positions_body

@@ -93,9 +93,7 @@ class CheckpointSchedule:
 
     def write_once(self, checkpoint: Checkpoint, position: tuple[int, int, bool]) -> None:
         """Write a checkpoint, unless the last one has the same position: segment, step, whether steps were computed.
-
-        Raises OutputError.
-        """
+        Raises OutputError."""
         self.requested = False
         if self._folder is None or position == self._written:
             return

@@ -125,8 +125,7 @@ def validation_messages(
 
 
 def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
-    """Path of keys and message of numbers in nested tables and lists whose absolute value is outside these limits. The
-    types of keys check infinities and NaN."""
+    """Path of keys and message of numbers in nested tables whose absolute value is outside these limits."""
     found: list[tuple[list, str]] = []
     rest: list[tuple[list, Any]] = [([], data)]
     while rest:
@@ -229,11 +228,8 @@ def suggestion(names: list[str]) -> str:
 
 
 def similar_names(name: str, known: Iterable[str]) -> list[str]:
-    """Known names that an unknown one may stand for.
-
-    They are the names that differ only in case and punctuation; else those that begin with it, such as a key without
-    its unit, or end with it; else the one with the most similar spelling.
-    """
+    """Known names that an unknown one may stand for: those that differ only in case and punctuation; else those that
+    begin with it, such as a key without its unit, or end with it; else the one with the most similar spelling."""
     known = list(known)
     if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
         return []

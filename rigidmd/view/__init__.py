@@ -27,10 +27,8 @@ def plot(results: Results, *columns: str, log: bool = False) -> "Picture":
 
 
 def show(results: Results) -> "StructureWidget | AnimationPage":
-    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page.
-
-    Raises ImportError without chemiscope, ValueError without a trajectory.
-    """
+    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises ImportError without
+    chemiscope, ValueError without a trajectory."""
     from rigidmd.view.notebook import show_animation
 
     return show_animation(results)

@@ -65,10 +65,8 @@ def _displacements(frames: RigidFrames, kind: Kind, lags: int) -> np.ndarray:
 
 @built_in("mean squared displacement of the centres of mass", position=50)
 def msd(frames: RigidFrames) -> AnalysisResult:
-    """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth of the frames.
-
-    Paths continue through the faces of the box, without the scaling by a barostat. Raises OutputError.
-    """
+    """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth of the frames. Paths
+    continue through the faces of the box, without the scaling by a barostat. Raises OutputError."""
     interval, lags = interval_and_lags(frames, "a mean squared displacement")
     curve = Curve("msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True))
     for kind in frames.moving:

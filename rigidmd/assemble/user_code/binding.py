@@ -98,8 +98,7 @@ def user_errors_explained(system: "System") -> Iterator[None]:
 
 
 def with_user_code(system: "System") -> "System":
-    """The system with the terms of [[forces.custom]], and the terms and the thermostat of user code from Python. Raises
-    SceneError with all errors."""
+    """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError with all errors."""
     scene, thermostat = system.scene, system.scene.user_code.thermostat
     user_code = UserCode((*custom_forces(scene), *scene.user_code.forces))
     names = user_code.force_names([*system.terms, *system.constants])

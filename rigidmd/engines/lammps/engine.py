@@ -135,8 +135,7 @@ class LammpsEngine(ExternalEngine):
         self._known_state = state.copy()
 
     def _receive(self, state: State) -> None:
-        """Write LAMMPS' state into `state`, and keep energies and forces for `evaluate`. Raises NotFiniteError,
-        SimulationError or EngineError."""
+        """Copy LAMMPS' state, energies and forces. Raises NotFiniteError, SimulationError or EngineError."""
         view = self._view
         energies = [f"c_e{n}" for n in range(len(self._styles))] + (["elong"] if view.has_ewald_sum else [])
         names = [*energies, *(f"c_virial[{k}]" for k in range(1, 7))]

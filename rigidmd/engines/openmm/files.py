@@ -85,8 +85,7 @@ with open("final.xml", "w") as file:
 
 
 def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
-    """Write the folder for a system that begins at a state, and return the names of its files. Raises OutputError, and
-    EngineError if OpenMM is not installed."""
+    """Write the folder for a system at a state; returns names of files. Raises OutputError or EngineError."""
     mm = library()
     particles = layout(view)
     position, velocity = (values * NM for values in particles.positions(state))

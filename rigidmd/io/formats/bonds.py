@@ -76,8 +76,7 @@ SLACK = 1.25
 
 
 def bonds(m: Any) -> list[tuple[int, int]]:
-    """Bonds between sites, heavier site first: atoms within bonding distance, the shortest links between parts, and
-    massless sites to their nearest atoms."""
+    """Bonds, heavier site first: atoms within bonding distance, shortest links, massless sites to nearest atoms."""
     atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
     part = {i: i for i in atoms}
     found = []

@@ -37,10 +37,8 @@ MAX_STABLE_FRACTION = 0.5
 
 
 def sums_of_square_frequencies(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
-    """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²).
-
-    By equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over the canonical distribution.
-    """
+    """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²). By
+    equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over the canonical distribution."""
     (force, torque), _ = engine.evaluate(state)
     model = system.model
     translation = float((force**2).sum(axis=1) @ model.inverse_mass[model.species])

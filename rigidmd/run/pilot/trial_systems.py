@@ -44,10 +44,8 @@ COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
 
 
 def natural_time(system: System, state: State) -> float | None:
-    """Time (ps) of one radian of the faster of vibration and libration; None at rest.
-
-    Its inverse squared is <F²/m> / <m v²>, the mean square frequency of harmonic motion; likewise for torques.
-    """
+    """Time (ps) of one radian of the faster of vibration and libration; None at rest. Its inverse squared is <F²/m> /
+    <m v²>, the mean square frequency of harmonic motion; likewise for torques."""
     model, momentum = system.model, state.angular_momentum_body
     motions = (
         float(model.mass[model.species] @ (state.velocity**2).sum(axis=1)),

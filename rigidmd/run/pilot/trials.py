@@ -159,10 +159,8 @@ class IntegratorAccuracy:
         return found
 
     def time_for(self, integrator: str, error: str, target: float) -> "ReachedError | None":
-        """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough.
-
-        At most its longest step, or `STABLE_FRACTION` of it where a longer one diverges.
-        """
+        """Where an integrator reaches an error, between its trials; None if its shortest step is not exact enough. At
+        most its longest step, or `STABLE_FRACTION` of it where a longer one diverges."""
         tried = [t for t in self.trials if t.integrator == integrator and not t.diverged and getattr(t, error) > 0]
         tried.sort(key=lambda t: -t.timestep)
         if not tried:
@@ -276,10 +274,8 @@ def time_span(system: TrialSystem, trial: Trial) -> float:
 
 
 def plan(system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
-    """Trials of integrators at time steps (in the unit of the system), adjusted to a whole number in the span.
-
-    Methods that choose their steps get tolerances instead.
-    """
+    """Trials of integrators at time steps (in the unit of the system), adjusted to a whole number in the span. Methods
+    that choose their steps get tolerances instead."""
     trials = {}
     for integrator, timesteps in steps.items():
         if system.methods[integrator].chooses_steps:

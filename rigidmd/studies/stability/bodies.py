@@ -259,10 +259,8 @@ NUDGE = 1e-9
 
 @register(5, error="log of the largest tilt, against theory")
 def sleeping_top(result: CaseResult, quick: bool) -> None:
-    """The sleeping top at 1 +- 1e-6 (and more) of its threshold: it falls below, and stays upright above.
-
-    Upright at rest but for omega_1 = e: theta = e t sinh(r t)/(r t) with r² = M g l/I1 - (L3/2 I1)², the sine above.
-    """
+    """The sleeping top at 1 +- 1e-6 (and more) of its threshold: it falls below, and stays upright above. Upright at
+    rest but for omega_1 = e: theta = e t sinh(r t)/(r t) with r² = M g l/I1 - (L3/2 I1)², the sine above."""
     for gap in (1e-4, -1e-4) if quick else (1e-3, -1e-3, 1e-6, -1e-6):
         rate = abs(1 - (1 + gap) ** 2) ** 0.5
         span = 8 / rate

@@ -164,8 +164,7 @@ def settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
 
 
 def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]:
-    """The checked points of a sweep over a scene file, and whether the scene is a single body. Raises SceneError with
-    all errors of all points."""
+    """The checked points of a sweep, and whether it is of a single body. Raises SceneError with all errors of all."""
     _check_axes(axes)
     keys = {axis.keys[0]: list(axis.keys) for axis in axes if axis.swept}
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}

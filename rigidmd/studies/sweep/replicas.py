@@ -128,8 +128,7 @@ def _mean_value(values: list[Value], runs: int) -> Value:
 
 
 def _mean_curve(curves: list[Curve]) -> Curve | None:
-    """The mean of curves in their common range, on the axis of the first; other axes are interpolated. None if they
-    have no range in common."""
+    """The mean of curves in their common range, interpolated to the axis of the first. None without such a range."""
     first = curves[0]
     if len(curves) == 1:
         return first

@@ -271,8 +271,7 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
 
 
 def _curves(table: Table, rows: list[SweepRow], key: str, words: list[str], column: str) -> dict[str, np.ndarray]:
-    """Positions, means and errors (3, p), NaN where there are none, for each combination of the other keys; without
-    keys of the single runs."""
+    """Positions, means and errors (3, p), NaN where there are none, for each combination of the other keys."""
     points: dict[str, list] = {}
     if table.keys:
         others = short_keys(other for other in table.keys if other != key)
