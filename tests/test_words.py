@@ -39,7 +39,7 @@ REFUSED = {
 }
 #: Further ones, which the sources of kernels still have: their next change, which compiles all anew, mends them.
 REFUSED_OUTSIDE_KERNELS = {
-    r"asks?(?! for help)|asked|asking": "request, require, call",
+    r"asks|asked": "request, require, call",
     r"in words|in a sentence": "with a message",
     r"films?": "animation",
     r"cut-offs?": "cutoff",
