@@ -315,7 +315,7 @@ def test_commands_in_the_text_are_commands(document):
         elif words[0] == "rigidmd" and words[1:2] != ["COMMAND"] and len(words) > 1:
             filled = [PLACEHOLDERS.get(word, word) for word in words[1:]]
             parse([word for word in filled if word][: filled.index(">") if ">" in filled else None])
-        elif words[:1] == ["python"]:
+        elif words[:1] == ["python"] and len(words) > 1:
             assert (ROOT / words[1]).is_file(), quoted
             source = (ROOT / words[1]).read_text()
             assert all(word in source for word in words if word.startswith("--")), quoted
