@@ -18,7 +18,8 @@ MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
 #: grids. Measured in mixed precision with 12288 sites, cutoffs of 6 to 9 Å and accuracies of 1e-4 to 1e-5.
 SHORTEST_CUTOFF, LIST_MARGIN, PAIR_NS = 5.0, 1.0, 1.0
 ORDERS = (4, 5, 6, 7, 8)
-SPACINGS = 3.0 * 0.98 ** np.arange(-250, 150)  # Å, from which grids are chosen
+COARSE_SPACING = 3.0  # Å, for a liquid
+SPACINGS = COARSE_SPACING * 0.98 ** np.arange(-250, 150)  # Å, from which grids are chosen
 MAX_GRID_POINTS = 2**16  # along an edge: enough for 0.1 mm
 #: Distances inside molecules that agree to FINE digits (Å) count as equal, with MANY_CHARGES those in bins of COARSE Å.
 FINE, COARSE, MANY_CHARGES = 6, 0.1, 200

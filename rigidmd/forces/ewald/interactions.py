@@ -9,7 +9,7 @@ import numpy as np
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, SPACINGS, alpha_for, charges_in, fastest_cutoff, filled_fraction, k_cutoff_for,
+    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, filled_fraction, k_cutoff_for,
     k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
@@ -86,11 +86,11 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
             "pme_grid out"
         )
         return Settings(numbers, [fault])
-    if grid is None and longest > MAX_GRID_POINTS * SPACINGS[0]:
-        fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
-        return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
     if grid is None or order is None:
         found = pme_grid_for(charges, alpha, cell, part, order, grid)
+        if found is None and longest > MAX_GRID_POINTS * COARSE_SPACING:
+            fault = f"an edge of {longest:.4g} Å is too long for a grid of {MAX_GRID_POINTS} points"
+            return Settings(numbers, [f"forces.electrostatics = 'pme': {fault}"])
         if found is None:
             given = " with the given forces.pme_order or pme_grid" if order or grid else ""
             fault = f"{unreachable}{given} at alpha = {alpha:.3g} 1/Å; use a lower accuracy or a longer cutoff"
