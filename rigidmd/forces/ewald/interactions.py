@@ -9,8 +9,8 @@ import numpy as np
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, filled_fraction, k_cutoff_for,
-    k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
+    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, filled_fraction,
+    k_cutoff_for, k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
