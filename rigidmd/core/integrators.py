@@ -1,12 +1,5 @@
-"""Integrators as data: rows of flows such as kick, drift, thermostat and barostat.
-
-A row contains the flows of a step with their fractions of the time step. Kick (forces and torques) and drift (free
-flight and free rotation) are symplectic and time-reversible, so any palindrome of them is too; the coefficients
-determine its order.
-
-Compositions of whole Verlet steps keep their order with any rotor, because such a step is symmetric for every symmetric
-rotor. All other rows need a drift that is the exact free motion: with the split rotor their order falls to 2.
-"""
+"""Integrators as data: rows of flows such as kick, drift, thermostat and barostat, with fractions of the time step. See
+the theory chapter `dynamics` for their orders and for the rows that need the exact rotor."""
 
 from itertools import pairwise, takewhile
 from math import inf, log2
@@ -91,11 +84,8 @@ class Scheme(_SchemeFields):
         return self._replace(flows=(*self.flows, Flow(BAROSTAT, float(every), every=every)), barostat=barostat)
 
     def with_piston(self, piston: tuple) -> "Scheme":
-        """This scheme, a composition of Verlet steps, with a volume that has inertia.
-
-        Each step kicks the volume before its first and after its last kick, and moves it before and after its drift;
-        such a step is symmetric, so the composition keeps its order.
-        """
+        """This scheme, a composition of Verlet steps, with a volume that has inertia: kicks of the volume around the
+        kicks of each step, changes of it around the drift. See the theory chapter `sampling`."""
         steps, flows = self.drifts, []
         for before, after in pairwise((0.0, *steps, 0.0)):
             flows += [Flow(KICK, before / 2), Flow(BAROSTAT, (before + after) / 2), Flow(KICK, after / 2)]

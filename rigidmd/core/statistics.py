@@ -17,14 +17,8 @@ LOST_FREEDOM = 2.5
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
-    """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN.
-
-    The error accounts for correlation; it is None if the samples are too few, or all of them correlated. It is the
-    larger of two estimates: one from a window of the correlation function, which is precise but misses a slow part
-    below fast noise, and one from batches, which includes it. Both are increased by their own uncertainty, so that
-    (mean - truth)/error has a standard deviation near 1: measured 0.8 (white noise) to 1.3 for n from 16 to 2000 and
-    lengths of at least 10 correlation times. For an oscillation the error is up to 1.6 times too large.
-    """
+    """Mean and standard error of evenly spaced samples (n,); None, None if a value is NaN. The error accounts for
+    correlation (theory chapter `errors`); it is None if the samples are too few, or all of them correlated."""
     array = np.array(values, dtype=float)
     n = len(array)
     if n == 0 or np.isnan(array).any():
@@ -50,8 +44,7 @@ def standard_error(values: ArrayLike) -> np.ndarray:
 
 
 def error_of_mean(parts: ArrayLike) -> np.ndarray:
-    """Standard error (...) of the mean of few independent values (n, ...), n > 1: half the range that holds 68 % of
-    their Student distribution, which is 1.84 times the usual one for two values, 1.14 times for five."""
+    """Standard error (...) of the mean of few independent values (n, ...), n > 1, see the theory chapter `errors`."""
     from scipy import special  # slow to import
 
     return standard_error(parts) * float(special.stdtrit(len(np.asarray(parts)) - 1, special.ndtr(1.0)))
@@ -101,13 +94,8 @@ def steady_from(values: np.ndarray) -> int:
 
 
 def _window(centred: np.ndarray) -> tuple[float, int]:
-    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum.
-
-    For a reversible process, sums of C at two successive lags are positive and decrease. The window ends before noise
-    makes a sum negative, and sums are made monotone (Geyer 1992, Statist. Sci. 7, 473, initial monotone sequence).
-    Because the sample mean was subtracted, each C is too low by the variance of that mean, which is corrected to first
-    order (Wolff 2004, Comput. Phys. Commun. 156, 143, eq. 49).
-    """
+    """1 + 2 sum C(k) of samples (n,) of mean zero, and the last k of the sum: the initial monotone sequence (Geyer
+    1992), corrected for the sample mean (Wolff 2004, eq. 49). See the theory chapter `errors`."""
     n = len(centred)
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[:n]
@@ -150,19 +138,8 @@ class Slope(NamedTuple):
 
 
 def slope(time: ArrayLike, value: ArrayLike) -> Slope:
-    """Slope of value (n,) against evenly spaced time (n,).
-
-    The energy of a symplectic run is not a line in white noise. Its fast part, of order dt², comes from the integrator.
-    Its slow part is a random walk, because potentials are smooth only to some order at their cutoff. The least-squares
-    error for white noise was too small by a factor 2.2 in 16 runs of 20 ps (64 waters, 1 fs). So both parts are
-    measured, from the Allan variances of few and of many block means,
-
-        A(m) = white/m + walk m/3,    error² = 12 white/n³ + 6 walk/(5 n)    (per sample spacing)
-
-    The walk is estimated from seven differences of eight blocks and multiplied by 1.4, the variance of their Student
-    distribution. Below white noise it is not detectable, so it is at least a fraction of the slow noise. slope/error
-    then has a standard deviation of 0.5 in white noise, and 1.1 to 1.5 in walks with and without white noise.
-    """
+    """Slope of value (n,) against evenly spaced time (n,), with an error that accounts for a random walk as well as for
+    white noise: see "Energy drift and its error" in the theory chapter `errors`."""
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
     n = len(time)

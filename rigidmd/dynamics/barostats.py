@@ -1,11 +1,8 @@
 """Barostats: flows that change the cell at a pressure, chosen by type; a constant volume compiles none.
 
-A move multiplies the cell (rows a, b, c) and the centres of mass from the right by a lower triangular matrix T, which
-keeps a along x and b in the xy plane. Rotations and angular momenta do not change, so the pressure follows from the
-molecular virial sum F (x) R, with W_ij = sum F_i R_j in `tally[1:]`.
-
-`apply_barostat` acts where a scheme has the flow BAROSTAT, `scale_box` where it has SCALE_BOX. The energy that a
-barostat adds to the molecules is summed in `state.energy_ledger[WORK]`.
+See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c) and the centres of
+mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`. `apply_barostat` acts where a scheme has the flow
+BAROSTAT, `scale_box` where it has SCALE_BOX. The energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log, sqrt
@@ -49,17 +46,8 @@ class NoBarostat(NamedTuple):
 
 
 class CellRescaling(NamedTuple):
-    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107), with an acceptance test.
-
-    The strain of each coordinate drifts by beta h/(3 tau) (P - P0) and gets noise of variance 2 kT beta h/(3 V tau n),
-    with n the number of components of the coordinate: d ln V = (beta/tau) (P - P0) dt + sqrt(2 kT beta/(V tau)) dW for
-    all three (anisotropic cells: Del Tatto, Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139). P follows from the
-    virial and the present kinetic energy; translational momenta are divided by T. The move is accepted or rejected by
-    the rule of Metropolis and Hastings, so that h, tau and beta cause no error in the sampled distribution,
-    exp(-(H + P0 V)/kT) with the measure dV and, if the cell changes its shape, the invariant measure of the strain.
-
-    Deviatoric pressures act as true (Cauchy) stress: their work is computed with the mean volume of the move.
-    """
+    """Stochastic cell rescaling (Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107; anisotropic cells: Del Tatto,
+    Raiteri, Bernetti & Bussi 2022, Appl. Sci. 12, 1139), with an acceptance test: see the theory chapter `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     pressure: Pressure
@@ -71,8 +59,7 @@ class CellRescaling(NamedTuple):
 
 
 class VolumeMoves(NamedTuple):
-    """Monte Carlo barostat: V' uniform about V, centres scaled, velocities kept (Åqvist et al. 2004, Chem. Phys. Lett.
-    384, 288); accepted with min(1, exp(-(dU + P0 dV)/kT + N ln(V'/V)))."""
+    """Monte Carlo barostat (Åqvist et al. 2004, Chem. Phys. Lett. 384, 288), see the theory chapter `sampling`."""
 
     thermal_energy: Ramp
     pressure: Pressure
@@ -85,9 +72,8 @@ class VolumeMoves(NamedTuple):
 class Piston(NamedTuple):
     """Isotropic volume with inertia and no noise (Andersen 1980, J. Chem. Phys. 72, 2384): constant enthalpy.
 
-    H = K + U + P0 V + Pi²/(2 M) in centres and momenta scaled by the edge. The flows are kicks of Pi (BAROSTAT) and
-    changes of V (SCALE_BOX), each exact. Pi is the last number of `state.extra_variables`. What P0 V and the piston
-    gain is subtracted from `energy_ledger[WORK]`.
+    Pi is the last number of `state.extra_variables`. BAROSTAT is a kick of Pi, SCALE_BOX a change of V, each exact.
+    What P0 V and the piston gain is subtracted from `energy_ledger[WORK]`. See the theory chapter `sampling`.
     """
 
     pressure: Pressure
@@ -110,9 +96,7 @@ class Confinement(NamedTuple):
     key: Key
 
 
-#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a `Confinement`. With the
-#: piston the volume oscillates with the period barostat_time_ps: the spring is dP/dV = -1/(compressibility V), so M =
-#: (period/2 pi)²/(compressibility V).
+#: Name of a barostat in `scene.couplings` -> the function that makes it for a stage from a `Confinement`.
 BAROSTATS = {
     "cell_rescaling": lambda stage, given: CellRescaling(
         given.thermal_energy, given.pressure, given.compressibility / stage.barostat_time,

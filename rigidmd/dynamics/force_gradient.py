@@ -1,12 +1,5 @@
-"""Kicks by the force and its gradient, for schemes of order 4 without negative steps.
-
-Such a kick has the potential U - (tau/2) [sum |F|²/m + sum n . I^-1 n] (Takahashi & Imada 1984; Chin 1997):
-
-    F + tau (d F/d x) . a,    n_body + tau [(d n_body/d x) . a + (I^-1 n_body) x n_body]
-
-where a moves each body along its F/m and rotates it along its I^-1 n_body. The derivative along a is a
-difference of two force evaluations, so it works for every potential and field. The second term of the torque arises
-because rotations do not commute: n_body is not a gradient with respect to coordinates.
+"""Kicks by the force and its gradient, for schemes of order 4 without negative steps (Takahashi & Imada 1984; Chin
+1997). The derivative is a difference of two force evaluations: see "Force gradients" in the theory chapter `dynamics`.
 """
 
 from typing import NamedTuple

@@ -44,12 +44,8 @@ class NoThermostat(NamedTuple):
 
 
 class VelocityRescaling(NamedTuple):
-    """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101).
-
-    All momenta, translational and rotational, are scaled by one factor, so that the kinetic energy follows a stochastic
-    equation that is solved exactly. The canonical distribution is sampled. The total momentum keeps its direction, and
-    the dynamics of single molecules hardly changes.
-    """
+    """Stochastic velocity rescaling (Bussi, Donadio & Parrinello 2007, J. Chem. Phys. 126, 014101) of all momenta,
+    translational and rotational, by one factor: see the theory chapter `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps; infinite: no effect
@@ -60,9 +56,8 @@ class VelocityRescaling(NamedTuple):
 
 
 class Langevin(NamedTuple):
-    """Friction and noise on every momentum: the Ornstein-Uhlenbeck process, solved exactly. p <- c p + sqrt(m kT (1 -
-    c²)) xi with c = exp(-friction h), and the same for each component of the angular momentum along an axis that has
-    inertia (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). Total momentum is not conserved."""
+    """Friction and noise on every momentum, along axes that have inertia: the Ornstein-Uhlenbeck process, solved
+    exactly (Davidchack, Ouldridge & Tretyakov 2015, J. Chem. Phys. 142, 144114). See the theory chapter `sampling`."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     friction_translation: float  # 1/ps
@@ -71,8 +66,7 @@ class Langevin(NamedTuple):
 
 
 class Andersen(NamedTuple):
-    """Random collisions with a gas (Andersen 1980, J. Chem. Phys. 72, 2384), after which a molecule has new momenta.
-    Each molecule collides independently, after `time_constant` on average. Total momentum is not conserved."""
+    """Random collisions, on average after `time_constant`, that redraw the momenta of one molecule (Andersen 1980)."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     time_constant: float  # ps
@@ -80,14 +74,9 @@ class Andersen(NamedTuple):
 
 
 class NoseHoover(NamedTuple):
-    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of `state.extra_variables`.
-
-    Each half is eta (links,), then d eta/dt (links,). The masses are Q_1 = g kT tau²/(2 pi)² and Q_j = kT tau²/(2 pi)²,
-    so each kinetic energy oscillates with the period tau. The energy of molecules and both chains is conserved, with
-    sum Q_j v_j²/2 + g kT eta_1 + kT sum of the other eta for each chain (Martyna, Tuckerman, Tobias & Klein 1996, Mol.
-    Phys. 87, 1117). The energy that a chain gains is subtracted from `energy_ledger[HEAT]`. A flow is integrated with
-    the Suzuki-Yoshida factors.
-    """
+    """Two Nose-Hoover chains, one of translation and one of rotation, on two halves of `state.extra_variables`. Each
+    half is eta (links,), then d eta/dt (links,). See the theory chapter `sampling` (Martyna, Tuckerman, Tobias & Klein
+    1996)."""
 
     thermal_energy: Ramp  # kB T, u Å²/ps²
     period: float  # ps

@@ -1,7 +1,5 @@
-"""Free-rotor flows: the rotation of a body without torque.
-
-The kernel `rotate(rotor, ...)` is chosen by the type at compile time, so a scene of points compiles no rotation.
-"""
+"""Free-rotor flows: the rotation of a body without torque. The kernel `rotate(rotor, ...)` is chosen by the type at
+compile time, so a scene of points compiles no rotation."""
 
 from math import cos, inf, nan, sin, sqrt
 from typing import NamedTuple
@@ -16,19 +14,10 @@ from rigidmd.mechanics.time_functions import TimeFunction, rate, value
 class SplitRotor(NamedTuple):
     """Composition of exact rotations: about L, and about the principal axes (Dullweber, Leimkuhler & McLachlan 1997).
 
-    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part, a spherical top, rotates about L and commutes with the rest,
-    which is Ra(h/2) Rb(h/2) Rc(h) Rb(h/2) Ra(h/2): order 2, symplectic, reversible; |L| and Q^T Q are conserved to
-    rounding.
-
-    a is the axis of the middle 1/I, b the axis whose 1/I is farther from it, c the third; g = (2/I_a + 1/I_c)/3.
-    With x, y, z = L_a², L_b², L_c² and A, B, C = 1/I - g, any such composition conserves, to order h², H + h²/24 times
-    2A (C - B) (B y (x - z) + C z (y - x)) - B²C y (x - z) - 2BC² z (y - x) - A² (B - C) x (z - y). This g makes C = -2A
-    and the error A² ((2A - 3B) xy + 8A yz + (3B - 10A) zx), of second order in 1/I_a - 1/I_c. Its rms in thermal motion
-    is 1/8 (SPC/E water) and 1/140 (H2S) of the smallest rms of any order of axes with g = 0. Compared with the smallest
-    for g = 1/I_c (the symmetric and asymmetric part of Dullweber et al.), it is less than 1/6 for each of 1,000 random
-    bodies, and 1/19 for most.
-
-    The flow of bodies with two equal moments is exact: A = C = 0. For linear and spherical bodies only g remains.
+    H = g |L|²/2 + sum (1/I_k - g) L_k²/2. The first part rotates about L and commutes with the rest, which is Ra(h/2)
+    Rb(h/2) Rc(h) Rb(h/2) Ra(h/2). a is the axis of the middle 1/I, b the axis whose 1/I is farther from it, c the
+    third; g = (2/I_a + 1/I_c)/3. See the theory chapter `dynamics` for the energy that it conserves. Bodies with two
+    equal moments move exactly; for linear and spherical bodies only g remains.
     """
 
     inverse_inertia: np.ndarray  # (species, 3), 1/(u Å²); 0 where the moment is 0
@@ -39,12 +28,8 @@ class SplitRotor(NamedTuple):
 
 
 class ExactRotor(NamedTuple):
-    """The exact free motion, to rounding, for any body and any time step.
-
-    Bodies with two equal moments have a closed form. For all others, the Taylor series of omega and of the quaternion
-    of the rotation are summed to rounding. Their terms follow by recurrence, because omega' and q' are quadratic.
-    Unlike Jacobi's functions, the series need no special cases (m -> 1, L along an axis, nearly equal moments). A
-    rotation by 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are divided into parts.
+    """The exact free motion, to rounding, for any body and any time step, by a closed form or by Taylor series: see the
+    theory chapter `dynamics`. A rotation by 0.03 to 0.3 rad takes 0.23 to 0.46 µs; longer ones are divided into parts.
     """
 
     inverse_inertia: np.ndarray  # all five as in SplitRotor
@@ -88,13 +73,9 @@ def _symmetry(moments: np.ndarray) -> int:
 
 
 class DrivenRotor(NamedTuple):
-    """A single body with wheels or a changing inertia: L = I(t) omega + h(t), with fixed principal axes.
-
-    h is the angular momentum of all wheels relative to the lab, along the body's axes. L' = L x omega + n includes the
-    terms -h' and -I' omega of Euler's equations, and H = sum (L_k - h_k)²/(2 I_k) still splits into exact rotations
-    about axes. I and h are evaluated at the middle of each time interval. The changes of H with I and h are computed
-    exactly and counted as work done on the body.
-    """
+    """A single body with wheels or a changing inertia, with L = I(t) omega + h(t): see the theory chapter `bodies`. I
+    and h are evaluated at the middle of each time interval. The changes of H with them are computed exactly, as work
+    done on the body."""
 
     inertia: TimeFunction
     momentum: TimeFunction
@@ -256,11 +237,8 @@ def rotate_about_axis(rotation, angular_momentum_body, m, k, angle):
 
 @kernel(inline=True)
 def sine_and_versine(angle):
-    """sin and 1 - cos of an angle, for rotations that are written as a change.
-
-    cos² + sin² is 1 only to rounding, so a rotation by the same angle would repeat the same error at every step.
-    Written as a change, the error is smaller by the angle squared, and only the sum is rounded, differently each time.
-    """
+    """sin and 1 - cos of an angle, for rotations that are written as a change: see "Rounding of Q" in the theory
+    chapter `dynamics`."""
     odd, even = rotation_coefficients(angle * angle)
     return angle * odd, angle * angle * even
 

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 BodyKind = Literal["point", "linear", "spherical", "symmetric", "asymmetric"]
 
 #: Two principal moments that differ by less than this fraction of the largest count as equal, and a smaller moment as
-#: zero. 1e-8 in inertia is 1e-4 in length: a bend of 0.0001 Å on a bond of 1 Å is a rounded coordinate, and at 300 K
-#: the body would spin about that axis ten thousand times too fast.
+#: zero: 1e-8 in inertia is 1e-4 in length, a rounded coordinate.
 SAME_MOMENT = 1e-8
 
 
@@ -45,11 +44,8 @@ def shifted_inertia(tensor: np.ndarray, mass: float, offset: np.ndarray) -> np.n
 
 
 def inertia_error(tensor: np.ndarray, scale: float = 0.0) -> str:
-    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists.
-
-    Moments must not be negative, and none may exceed the sum of the others. The tolerance for rounding is 1e-12 of the
-    largest moment, or of `scale` if the tensor is a difference of larger ones.
-    """
+    """Why no mass distribution has this inertia tensor (3, 3); empty if one exists. The tolerance for rounding is 1e-12
+    of the largest moment, or of `scale` if the tensor is a difference of larger ones."""
     low, middle, high = np.linalg.eigvalsh(tensor)
     slack = 1e-12 * max(abs(low), abs(high), scale)
     if low < -slack:
@@ -186,10 +182,9 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
 def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:
     """Added mass (3,) and added inertia (3,) along and about the axes of an ellipsoid in an ideal fluid at rest.
 
-    semi_axes (3,), all positive; density of the fluid. H. Lamb, Hydrodynamics (6th ed. 1932), art. 114-115, with
-    alpha_i = abc ∫ dl / ((a_i² + l) Delta), whose sum is 2. Lamb's differences are written as integrals of one sign:
-    gamma - beta = (b² - c²) near and 2 (b² - c²) + (b² + c²) (beta - gamma) = (b² - c²) (alpha + 2 far), so that
-    (b² - c²)² near / (alpha + 2 far) is not 0/0 for equal axes, and has no cancellation for nearly equal ones.
+    semi_axes (3,), all positive; density of the fluid. See the theory chapter `bodies` (Lamb, art. 114-115). Lamb's
+    differences are written as integrals of one sign, (b² - c²)² near/(alpha + 2 far), which has no cancellation for
+    nearly equal axes.
     """
     from scipy.special import elliprd  # slow to import, and other solids do not need it
 

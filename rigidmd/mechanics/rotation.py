@@ -1,8 +1,5 @@
-"""Rotation matrices Q (body to lab, x_lab = Q x_body) in NumPy, for code that is not performance critical.
-
-Conversions from and to quaternions (w, x, y, z), Euler angles (phi, theta, psi) in the sequence 3-1-3, yaw, pitch
-and roll in the sequence 3-2-1, and attitude matrices. Angles are in rad.
-"""
+"""Rotation matrices Q (body to lab, x_lab = Q x_body) in NumPy, for code that is not performance critical: conversions
+from and to quaternions (w, x, y, z), 3-1-3 Euler angles, 3-2-1 yaw, pitch and roll, and attitude matrices; rad."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,11 +29,8 @@ def unit_vector(vector: ArrayLike) -> np.ndarray:
 
 
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z; the first non-zero component is positive.
-
-    Q determines the products of any two components; the row of the largest component has no cancellation at any angle
-    (Shepperd 1978, J. Guid. Control 1, 223).
-    """
+    """Unit quaternions (..., 4) of Q (..., 3, 3) in order w, x, y, z; the first non-zero component is positive. No
+    angle has cancellation (Shepperd 1978, J. Guid. Control 1, 223)."""
     q = np.asarray(rotation, dtype=float)
     xx, yy, zz = q[..., 0, 0], q[..., 1, 1], q[..., 2, 2]
     wx, xw = q[..., 2, 1] - q[..., 1, 2], q[..., 2, 1] + q[..., 1, 2]
@@ -72,11 +66,8 @@ def from_euler_angles(euler_angles: np.ndarray) -> np.ndarray:
 
 
 def to_euler_angles(rotation: np.ndarray) -> np.ndarray:
-    """3-1-3 Euler angles (..., 3) of Q (..., 3, 3): phi and psi in (-pi, pi], theta in [0, pi].
-
-    Where sin(theta) is 0, only phi + psi (theta = 0) or phi - psi (theta = pi) is defined, and psi is set to 0. Nearby,
-    phi is limited by rounding; psi follows from Rz(-phi) Q, so that the three together still give Q to rounding.
-    """
+    """3-1-3 Euler angles (..., 3) of Q (..., 3, 3): phi and psi in (-pi, pi], theta in [0, pi]; psi = 0 where
+    sin(theta) is 0. The three together give Q to rounding, also near it."""
     q = np.asarray(rotation, dtype=float)
     sin_theta = np.hypot(q[..., 0, 2], q[..., 1, 2])
     locked = sin_theta == 0
@@ -113,9 +104,7 @@ def angular_velocity_of_euler_rates(euler_angles: np.ndarray, rates: np.ndarray)
 
 def euler_rates(euler_angles: np.ndarray, angular_velocity_body: np.ndarray) -> np.ndarray:
     """Time derivatives (..., 3) of the 3-1-3 angles (..., 3) of a body that rotates with omega (..., 3), body frame.
-
-    Raises ValueError where sin(theta) is 0 to rounding: phi and psi then rotate about the same axis and have no rates.
-    """
+    Raises ValueError where sin(theta) is 0 to rounding."""
     (_, ct, cp), (_, st, sp) = _cosines_and_sines(euler_angles)
     if np.any(np.abs(st) <= 4 * np.finfo(float).eps):
         raise ValueError(
@@ -144,11 +133,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def orthogonality_error(rotation: np.ndarray) -> float:
-    """Largest entry of |Q^T Q - 1| over a stack (..., 3, 3); 0 for an empty stack.
-
-    The split rotor multiplies Q by plane rotations whose cos² + sin² is 1 to rounding. Each step adds at most a few
-    1e-17 of random sign, and nothing corrects Q, so the error grows like a random walk.
-    """
+    """Largest entry of |Q^T Q - 1| over a stack (..., 3, 3); 0 for an empty stack."""
     if len(rotation) == 0:
         return 0.0
     # entry by entry over the stack, because NumPy is seven times as slow for products of many small matrices

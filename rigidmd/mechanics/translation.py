@@ -1,12 +1,6 @@
 """The translation of a single body: free, none, or through an ideal fluid with added mass; frames of reference.
-
-`translate(translation, ...)` is chosen by the type at compile time, so a pinned body compiles no translation.
-
-In a non-inertial frame motion is relative to axes that rotate about an origin, which may be accelerated. Momenta are
-those relative to non-rotating axes, in components along the axes of the frame. The frame then adds one flow, a rotation
-of position, velocity and Q, from which Coriolis, centrifugal and Euler forces follow. The acceleration of the origin is
-a uniform field.
-"""
+`translate(translation, ...)` is chosen by the type at compile time, so a pinned body compiles no translation. See the
+theory chapter `bodies`."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -31,12 +25,8 @@ class NoTranslation(NamedTuple):
 
 
 class FluidTranslation(NamedTuple):
-    """A body in an ideal fluid: Kirchhoff's equations P' = P x omega, L' = L x omega + P x v with v = M^-1 P.
-
-    `state.velocity` is the impulse of body and fluid over the body's mass, lab frame. The principal axes of M are those
-    of I, and the centre of mass is the centre of the fluid's inertia (Lamb, Hydrodynamics, art. 124). The moments of
-    inertia of the rotor include the added ones.
-    """
+    """A body in an ideal fluid: Kirchhoff's equations, see the theory chapter `bodies`. `state.velocity` is the impulse
+    of body and fluid over the body's mass, lab frame. The moments of inertia of the rotor include the added ones."""
 
     mass: float
     inertial_mass: np.ndarray  # (3,) mass and added mass along the body's axes
@@ -122,9 +112,7 @@ class InertialFrame(NamedTuple):
 
 
 class RotatingFrame(NamedTuple):
-    """Axes that rotate. The flow is exact for a constant rate, and for one about a fixed axis that is linear in time.
-    Otherwise each drift is symmetric and of order 2: compositions of symmetric steps keep their order, other schemes
-    fall to order 2."""
+    """Axes that rotate, by one more flow: see the theory chapter `bodies` for its order."""
 
     angular_velocity: TimeFunction  # along the axes of the frame
 

@@ -1,14 +1,7 @@
 """Runs of molecules as `ase.Atoms`; forces on atoms, in two forms with the same totals on each molecule.
 
-`gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's force F and torque,
-
-    f_i = m_i (F/M + w x y_i),   K w = torque,   K = tr(C) 1 - C,   C = sum m_i y_i (x) r_i,
-
-with the atoms r_i and their positions y_i in the rigid molecule, both from the centre of mass. These forces are minus
-the gradient of the energy as a function of atoms to which rigid molecules are fitted with masses m_i, bent or not: a
-shift of the atoms rotates the fit by phi, K phi = sum m_i y_i x shift_i. They vanish at a minimum. Constraints on all
-distances reduce any other form to them. K is the inertia tensor of molecules that are not bent.
-
+`gradient_forces`: every atom has the force of the rigid motion that follows from the molecule's force and torque, minus
+the gradient of the energy as a function of atoms to which rigid molecules are fitted; the guide `ase` has the formula.
 `site_forces`: each atom has the forces on its site. Forces on massless sites are distributed over the atoms. Forces
 inside molecules are included; constraints have to balance them.
 """

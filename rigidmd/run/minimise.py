@@ -115,10 +115,8 @@ class Enthalpy:
         rotations about principal axes, Q <- Q exp(hat(phi)), as phi times the radius of the molecule (3 n; 0 of points)
         strains of the cell, one for each coordinate of the coupling: R <- R T, cell <- cell T, where T is lower
         triangular as in `barostats`, with the exponentials of the first three strains on its diagonal, the rest below.
-        A strain is multiplied by sqrt(m N) (V/N)^(1/3), for N molecules and m components that share the coordinate:
-        in a strain all N distances to neighbours, about (V/N)^(1/3), change together. A flexible cell of ice Ih (192
-        TIP4P/2005) took 50 iterations; 54 and 338 with strains scaled by 0.3 and 3 times as much, 63 and 59 with
-        rotations scaled by 0.5 and 2 times as much
+        A strain is multiplied by sqrt(m N) (V/N)^(1/3), for N molecules and m components that share the coordinate;
+        the guide `ensembles` has the reason and a measurement
 
     Axes without inertia do not rotate. The derivative for the strain follows from the molecular virial W = sum F (x) R,
     dU/dT_ij = -W_ji. Forces are in double precision, as energies need many digits near a minimum.

@@ -262,12 +262,8 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
 
 
 def _temperature_scatter(temperature: np.ndarray, freedom: int) -> float | None:
-    """Standard deviation (K) of the mean temperatures of nve stages that start from states of a canonical ensemble.
-
-    It is T sqrt(k/C_v). Without the heat capacity: the variance of the temperature of canonical states, 2 T²/f, is the
-    mean of its variances at their energies plus the variance of its means at them. 40 runs of 100 argon atoms at 100 K
-    scattered by 6.6 ± 0.7 K, and this gave 6.6 K for them. None if sampling hides it.
-    """
+    """Standard deviation (K) of the mean temperatures of nve stages that start from states of a canonical ensemble, see
+    "Temperatures after a thermostat" in the theory chapter `errors`. None if sampling hides it."""
     square = 2 * temperature.mean() ** 2 / freedom - temperature.var() if freedom else 0.0
     return sqrt(square) if square > 0 else None
 

@@ -44,11 +44,8 @@ def read(form, model, state, time, y):
 
 @kernel(from_python=True)
 def write_rates(form, model, terms, state, load, time, y, dy):
-    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the axes of the frame.
-
-    I w' = n + L x w + P x v - h' - I' w; X' = v - Omega x X; V' = F/m - Omega x V; attitude by w - Q^T Omega;
-    W' = the power of drives and resistance, relative to the frame, and of changes of I and h.
-    """
+    """Write the rates of all variables into dy; returns a status code. Lab vectors are along the axes of the frame. See
+    "The equations of motion" in the theory chapter `bodies`."""
     read(form, model, state, time, y)
     status = compute_body_load(terms, state, load)
     if status != OK:

@@ -1,9 +1,5 @@
-"""Resistance: bearings, air and fluids that take energy from a single body, along and about its axes.
-
-It acts within the kick: at fixed positions, the momentum along each axis under a constant load and resistance has a
-closed form. So a body in a viscous fluid has its terminal speed for any step, and dry friction holds a body at rest.
-The step is of order 2.
-"""
+"""Resistance: bearings, air and fluids that take energy from a single body, along and about its axes. It acts within
+the kick, by a closed form at fixed positions: see the theory chapter `bodies`."""
 
 from math import copysign, exp, expm1, log1p, sqrt
 from typing import NamedTuple
@@ -25,8 +21,7 @@ class NoResistance(NamedTuple):
 
 class Resistance(NamedTuple):
     """Force -(linear + quadratic |v|) v and torque -(linear + quadratic |w|) w - dry sign(w), for each body axis. v and
-    w are relative to the frame; |v| and |w| are the lengths of the vectors, so equal coefficients mean isotropic
-    resistance. Dry friction is the friction of a bearing about a body axis under constant load."""
+    w are relative to the frame; |v| and |w| are the lengths of the vectors."""
 
     linear: np.ndarray  # (3,)
     quadratic: np.ndarray  # (3,)
@@ -171,8 +166,7 @@ def kick_translation(resistance, translation, rotor, frame, state, load, h):
 
 @kernel
 def resisted_motion(speed, push, dry, linear, h):
-    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0. Dry
-    friction stops the motion in a finite time, and holds the body at rest unless the push is stronger."""
+    """(s, integral of s) after a time h of s' = push - dry sign(s) - linear s, per unit inertia; dry, linear >= 0."""
     s = abs(speed)
     sign = copysign(1.0, speed)
     if s == 0.0:

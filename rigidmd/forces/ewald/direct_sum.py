@@ -1,19 +1,9 @@
 """Ewald sums: charges in a periodic box with all their images, and the direct sum over k-vectors.
 
-    E = sum over pairs inside the cutoff q_i q_j erfc(alpha r)/r      screened_coulomb.ScreenedCoulomb
-      + 2 pi/V sum over k != 0 exp(-k²/4 alpha²)/k² |S(k)|²           EwaldSum, or pme.Pme
-      - alpha/sqrt(pi) sum q_i²                                       corrections.self_energy
-      - sum over pairs inside molecules q_i q_j erf(alpha r)/r        corrections.intramolecular_energy
-      - pi/(2 V alpha²) (sum q_i)²                                    corrections.Background
-      + 2 pi/((2 eps + 1) V) |sum q_i r_i|²                           corrections.SurfaceDipole
-
-(de Leeuw, Perram & Smith 1980; Allen & Tildesley 2017, 6.2), with S(k) = sum q_i exp(i k r_i), and q in units where
-q²/r is an energy. The last term describes a large sphere of boxes in a medium of permittivity eps; it is 0 for a
-conductor ("tin foil"), the usual choice.
-
-The sum over k includes the pairs inside molecules. In a rigid body such a pair exerts no net force and no torque, so
-only its energy, a constant, has to be subtracted. The cell may have any shape: k is 2 pi (n_x, n_y, n_z) times the
-reciprocal edges.
+See the theory chapter `interactions` for the six terms of the energy. They are, in its order: the pairs inside the
+cutoff, `screened_coulomb.ScreenedCoulomb`; the sum over k-vectors, `EwaldSum` or `pme.Pme`; and of `corrections`:
+`self_energy`, `intramolecular_energy`, `Background`, `SurfaceDipole`. Charges are in units where q²/r is an energy. The
+cell may have any shape.
 """
 
 # isort: skip_file
@@ -283,11 +273,8 @@ def _sum_structure_factors(arguments, block):
 
 @kernel(inline=True, count_references=False)
 def add_k_vector(tally, energy, n, b, alpha):
-    """Add energy and virial of k = 2 pi n times the reciprocal edges, with the rows of b (3, 3) 2 pi times these.
-
-    The energy is proportional to |S|² exp(-k²/4 alpha²)/(k² V), and the virial is energy (1 - slope k k) with slope =
-    2/k² + 1/(2 alpha²), for sites that are scaled with the cell (Nose & Klein 1983, Mol. Phys. 50, 1055).
-    """
+    """Add energy and virial (Nose & Klein 1983) of k = 2 pi n times the reciprocal edges, with the rows of b (3, 3) 2
+    pi times these."""
     k = (
         n[0] * b[0, 0] + n[1] * b[1, 0] + n[2] * b[2, 0],
         n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],

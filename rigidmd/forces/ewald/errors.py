@@ -1,8 +1,6 @@
-"""Estimated errors of Ewald sums, and the settings that keep them within a given accuracy.
+"""Estimated errors of Ewald sums, and the settings that keep them within an accuracy: theory chapter `interactions`.
 
-An error is the root mean square over sites of the error vector of the force on a site, for molecules with random
-positions and orientations. Its unit is COULOMB, the force between two charges e at a distance of 1 Å, as for the
-accuracy of kspace_style in LAMMPS.
+The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance of 1 Å.
 """
 
 from functools import cache
@@ -75,8 +73,7 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
 
 
 def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> float:
-    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1. In a dilute box the error
-    of forces is that of such a cluster, not the error at the mean density."""
+    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1."""
     filled = 0.0
     for m, n in zip(species, map(int, counts), strict=True):
         filled += n * (2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma)) ** 3
@@ -84,8 +81,7 @@ def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> fl
 
 
 def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
-    """Error from the k-vectors beyond k = radius (1/Å), as an integral over them. Like eq. 32 of Kolafa & Perram, but
-    the charges inside a molecule are correlated, and the integral is not expanded for large radius/alpha."""
+    """Error from the k-vectors beyond k = radius (1/Å), see the theory chapter `interactions`."""
     k = np.linspace(radius, radius + 12 * alpha, 600)
     # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
     density = 8 * np.exp(-(k**2) / (2 * alpha**2)) * charges.form(k)
@@ -116,13 +112,8 @@ def pme_error(
     charges: Charges, alpha: float, cell: np.ndarray, grid: tuple[int, int, int], order: int,
     proxy_points: int = MAX_PROXY_POINTS,
 ) -> float:  # fmt: skip
-    """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows the edges.
-
-    A Fourier component k of the charge causes components k' of the potential, at k and its aliases, with factors
-    G U(k) U(k'). The error is the difference of G U² from g for k' = k, and the whole component for other k'. Errors
-    add up in the mean square, times k'² for the force (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem.
-    Phys. 128, 214106).
-    """
+    """Error of smooth PME with the influence function G of `pme`, on a grid in a cell (3, 3), rows the edges. See the
+    theory chapter `interactions` (Hockney & Eastwood 1988, 8-22; Stern & Calkins 2008, J. Chem. Phys. 128, 214106)."""
     grid = np.array(grid)
     volume = abs(np.linalg.det(cell))
     points = np.minimum(grid, proxy_points)
@@ -210,8 +201,7 @@ def fastest_cutoff(
     charges: Charges, cell: np.ndarray, longest: float, error: float, filled: float
 ) -> float | None:  # fmt: skip
     """The real-space cutoff (Å), at most `longest`, with which PME is fastest if real and reciprocal space each have
-    this error; None if no cutoff reaches it. It follows from numbers of operations, not from a clock: the same scene
-    has the same cutoff everywhere. filled : see `filled_fraction`; molecules may gather in this part of the volume"""
+    this error; None if no cutoff reaches it. filled : see `filled_fraction`"""
     volume, cutoffs = abs(float(np.linalg.det(cell))), np.arange(SHORTEST_CUTOFF, longest, 0.5)
 
     @cache
@@ -235,9 +225,8 @@ ALIASES = 30  # largest |m| in sums; its term is 1e-7 of the first for order 3, 
 
 
 class Aliases(NamedTuple):
-    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an FFT. A grid of K
-    points cannot distinguish a Fourier component n from its aliases n + m K. Spreading charges by B-splines (see
-    `pme.weights`) multiplies these by U(n + m K) = sinc((n + m K)/K)^p."""
+    """Sums over the aliases of each Fourier component along one axis (points,), in the order of an FFT. Spreading
+    charges by B-splines (see `pme.weights`) multiplies component n of K points by sinc(n/K)^p."""
 
     n: np.ndarray  # -K/2 < n <= K/2
     odd: np.ndarray  # n, but 0 where n and -n are the same component

@@ -2,17 +2,9 @@
 
     charges -> grid -> Fourier transform, times the influence function -> potential on the grid -> forces
 
-Charges are spread over order³ grid points by B-splines, and forces are the exact gradient of the energy on the grid
-(Essmann et al. 1995, J. Chem. Phys. 103, 8577), so a run conserves that energy. The influence function has the smallest
-error of the forces (Hockney & Eastwood 1988, ch. 8; Ballenegger, Cerda & Holm 2012, J. Chem. Theory Comput. 8, 936, for
-forces by differentiation): smaller errors than with the function of Essmann et al., in the same time.
-
-The forces from the grid do not sum to zero, and pairs inside a rigid molecule exert a force on it. Both are part of the
-error that `errors.pme_error` estimates. Without them the forces would not be a gradient.
-
-The work is divided into blocks of planes, of rows of Fourier components, and of sites. Sites are sorted by plane, and
-each plane is written by one block. The number of blocks does not depend on the number of threads, so the result is the
-same bit for bit. This module needs rocket-fft; only scenes with PME import it.
+See the theory chapter `interactions`. The work is divided into blocks of planes, of rows of Fourier components, and of
+sites. Sites are sorted by plane, and each plane is written by one block. The number of blocks does not depend on the
+number of threads, so the result is the same bit for bit. This module needs rocket-fft; only scenes with PME import it.
 """
 
 # isort: skip_file

@@ -1,17 +1,8 @@
-"""A uniform electric field on molecules, steady or oscillating.
+"""A uniform electric field on molecules, steady or oscillating: U = -E . M, see the theory chapter `interactions`.
 
-    U = -E . M,  M = sum over molecules (q R + Q mu_body),  E(t) = E0 cos(w t + phase)
-
-with the net charge q of a molecule, its centre of mass R and its dipole mu about that. The force on it is q E, the
-torque mu x E.
-
-R is never wrapped, so a charge that moves through the images of a periodic box keeps gaining energy from the field.
-With a net charge U has no lower bound, but kinetic plus potential energy is conserved. The energy of molecules without
-a net charge does not depend on R.
-
-With an oscillating field, energy is conserved only together with the work of the field, dH/dt = dU/dt at fixed
-positions = -(dE/dt) . M. Every kick adds this work over its part of the step to the energy ledger. This is the flow of
-the momentum that is conjugate to time as a coordinate, so energy less work is conserved as well as any Hamiltonian.
+Every kick adds the work of an oscillating field, -(dE/dt) . M, over its part of the step to the energy ledger. This is
+the flow of the momentum that is conjugate to time as a coordinate, so energy less work is conserved as well as any
+Hamiltonian.
 """
 
 from math import cos, pi, radians, sin

@@ -1,12 +1,7 @@
 """One or two flat walls perpendicular to an axis of the lab, which act on sites at unwrapped positions.
 
-    Lennard-Jones 9-3 : U = epsilon [(2/15) (sigma/d)^9 - (sigma/d)^3], less its value at the cutoff, and 0 beyond it
-    harmonic          : U = stiffness/2 d² behind the wall, 0 in front of it
-
-with the distance d of a site from the wall. The first is half a space of Lennard-Jones sites, integrated (Steele 1973,
-Surf. Sci. 36, 317; `fix wall/lj93` of LAMMPS has the same form and truncation), with a well of depth (sqrt(10)/3)
-epsilon at (2/5)^(1/6) sigma. It is not defined on and behind the wall: a site there ends the evaluation with
-BEHIND_WALL. The harmonic wall is soft; `fix wall/harmonic` of LAMMPS has no factor 1/2.
+See the theory chapter `interactions`. The Lennard-Jones 9-3 wall is not defined on and behind the wall: a site there
+ends the evaluation with BEHIND_WALL.
 """
 
 from math import inf, isnan

@@ -2,17 +2,8 @@
 
 A row is two sites near one another, so that what is loaded of a cluster serves both. The rows of a cluster have almost
 the same neighbours: these are listed once, with the vectors between origins, and an entry of a row is an index in that
-list.
-
-A list is built for reference positions of the sites, and is valid while no site is farther from its reference than half
-the skin. The engine checks this at every force evaluation, before it uses the list, so it never misses a pair. The
-references are predicted positions, some steps ahead: sites first approach them, so the list is valid for longer. If the
-box has changed since the build, the displacement of the images is subtracted from the skin. The clusters of each row
-are sorted into shells by distance. The displacements of the sites determine how many shells can matter, so right after
-a build the loop does as much work as without a skin.
-
-Each pair of clusters is stored once, with the clusters taken as a ring. The list is divided into blocks of rows, and
-any thread may fill any block: the list, and every sum over it, has the same bits for any number of threads.
+list. The clusters of each row are sorted into shells by distance; the displacements of the sites determine how many
+shells can matter. See the theory chapter `interactions` for when a list is valid.
 
 This module has the list and how it is read; `update` decides when it is rebuilt, `rows` fills it.
 """

@@ -1,9 +1,6 @@
-"""Forces between pairs of sites: the one loop for every pair potential.
-
-A potential computes only the energy and force between one site and a vector of others at given distances, by an
-`@implements(pair)` for its NamedTuple, and puts its numbers for each site into the order of the slots (`arrange`). This
-loop finds the pairs and their images, sums energies, virial and forces, and adds the forces to the bodies.
-"""
+"""Forces between pairs of sites: the one loop for every pair potential. It finds the pairs and their images, sums
+energies, virial and forces, and adds the forces to the bodies. A potential is an `@implements(pair)` for its
+NamedTuple, which puts its numbers for each site into the order of the slots (`arrange`)."""
 
 # isort: skip_file
 from math import inf

@@ -19,9 +19,8 @@ from rigidmd.forces.neighbors.space import follow_cell
 from rigidmd.forces.neighbors.tree import fit_boxes
 from rigidmd.forces.terms import copy
 
-#: A list is built for positions predicted ahead by this fraction of the lifetime of the last list: sites first approach
-#: these. The list is valid for longer by a fifth (water) or a half (nitrogen). With a larger fraction the sites are
-#: farther from the predictions on average, and the loop has to work through more shells.
+#: A list is built for positions predicted ahead by this fraction of the lifetime of the last list. With a larger one
+#: sites are farther from the predictions on average, and the loop has to work through more shells.
 LEAD_FRACTION = 0.25
 
 

@@ -19,9 +19,8 @@ from rigidmd.units import COULOMB_CHARGE
 
 
 class ReactionField(NamedTuple):
-    """q_i q_j (1/r + field r²), truncated at the cutoff. field = (eps - 1)/((2 eps + 1) cutoff³) is the response of a
-    continuum of permittivity eps beyond the cutoff to the charges inside (Tironi et al. 1995, J. Chem. Phys. 102,
-    5451). Without a cutoff the field is 0: plain Coulomb."""
+    """q_i q_j (1/r + field r²), truncated at the cutoff; field is k of the theory chapter `interactions` (Tironi et al.
+    1995, J. Chem. Phys. 102, 5451). Without a cutoff the field is 0: plain Coulomb."""
 
     cutoff: float  # Å
     truncation: Truncation
@@ -111,9 +110,8 @@ def _pair(potential, i, j, r2):
 
 
 def self_energy(potential: ReactionField, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of the charges of one molecule in their reaction field. position (s, 3) of the charged sites of
-    the molecule, in the order of the first s of potential.charge. The energy is constant for a rigid body; for a
-    neutral molecule of dipole mu well inside the cutoff it is -field mu²."""
+    """Energy (u Å²/ps²) of the charges of one molecule in their reaction field, a constant. position (s, 3) of the
+    charged sites of the molecule, in the order of the first s of potential.charge."""
     charge = potential.charge[: len(position)]
     energy = 0.5 * charge @ charge * potential.terms[0]
     for i in range(len(position)):

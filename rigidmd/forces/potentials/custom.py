@@ -134,8 +134,7 @@ def _arrange(slot_potential, potential, order):
 
 
 def tail_of_pair(radial: Callable[[float], tuple], terms: np.ndarray, truncation: Truncation) -> tuple[float, float]:
-    """The tail correction of one pair: of the energy, times the volume, and of the pressure, times its square. 2 pi J
-    with J = integral of r² (full - truncated), and 2 pi (J + R³ U/3) with the energy U at the cutoff R, see
+    """The tail correction of one pair: of the energy, times the volume, and of the pressure, times its square. See
     `lennard_jones.tail`. Raises ArithmeticError if the energy falls too slowly."""
     cutoff = truncation.cutoff
     far = [abs(radial(factor * cutoff)[0]) * factor**3 for factor in (1.0, 1e3)]

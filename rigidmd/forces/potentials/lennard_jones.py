@@ -244,12 +244,8 @@ def _arrange(slot_potential, potential, order):
 
 
 def tail(potential: LennardJones) -> Tail:
-    """The tail correction, for g(r) = 1 where the truncation changes the potential.
-
-    U = (2 pi / V) sum_ij N_i N_j J_ij with J = integral of r² (full - truncated). If the truncation shifts the whole
-    potential, the constant inside counts too, as in GROMACS' dispersion correction (Allen & Tildesley 2017, 2.8). All
-    N² pairs are counted, with those of a molecule with itself: a relative error of 1/(number of molecules).
-    """
+    """The tail correction, for g(r) = 1 where the truncation changes the potential, see the theory chapter
+    `interactions` (Allen & Tildesley 2017, 2.8)."""
     count = np.bincount(potential.kind, minlength=len(potential.c6))
     energy = pressure = 0.0
     for sign, c, p, terms in ((1, potential.c12, 12, potential.terms12), (-1, potential.c6, 6, potential.terms6)):

@@ -1,13 +1,9 @@
 """Screened Coulomb potential q_i q_j erfc(alpha r)/r: the real-space part of Ewald sums, and damped shifted forces.
 
-The pair loop computes neither erfc nor exp. The screening part erf(alpha r)/r is a smooth function of r², and so is its
-force over r. Each is a polynomial in r², fitted when the potential is created, with as many terms as the cutoff, alpha
-and the precision of the loop require. A vector of pairs then costs one inverse square root and one multiply-add per
-term.
-
-In vectors of 16 float32 the force is a cubic in each of 32 intervals of r²: a lookup takes one instruction, which runs
-in parallel with the multiply-adds. For PME with a cutoff of 9 Å the loop takes 4 to 10 % less time than with the ten
-terms that it would need, and the force is 30 times as accurate; without any screening it would take 14 to 20 % less.
+The pair loop computes neither erfc nor exp: erf(alpha r)/r, and its force over r, are polynomials in r², fitted when
+the potential is created. A vector of pairs then costs one inverse square root and one multiply-add per term. In vectors
+of 16 float32 the force is a table of cubics in r², whose lookups run in parallel with the multiply-adds. See the theory
+chapter `interactions`.
 """
 
 # isort: skip_file
@@ -130,9 +126,8 @@ def _series(x: float, power: int) -> np.ndarray:
 
 
 class ScreenedCoulomb(NamedTuple):
-    """q_i q_j [erfc(alpha r)/r - shift], truncated at the cutoff R: the pair part of an Ewald sum. With shift =
-    erfc(alpha R)/R the energy is the one that the forces conserve. Without a shift the energy jumps when a pair crosses
-    the cutoff, which is most of its noise at small steps. The forces are the same."""
+    """q_i q_j [erfc(alpha r)/r - shift], truncated at the cutoff R: the pair part of an Ewald sum. shift is erfc(alpha
+    R)/R, or 0: the energy then jumps when a pair crosses the cutoff, which is most of its noise at small steps."""
 
     cutoff: float  # Å
     alpha: float  # 1/Å
@@ -163,9 +158,8 @@ def screened_coulomb(
 
 
 class DampedShiftedForce(NamedTuple):
-    """q_i q_j [erfc(alpha r)/r - erfc(alpha R)/R + slope (r - R)]: energy and force are 0 at the cutoff R. slope =
-    erfc(alpha R)/R² + 2 alpha exp(-alpha² R²)/(sqrt(pi) R) (Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq.
-    18); the same as coul/dsf of LAMMPS."""
+    """Damped shifted force (Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 18), see the theory chapter
+    `interactions`; the same as coul/dsf of LAMMPS."""
 
     cutoff: float  # Å
     alpha: float  # 1/Å
@@ -265,12 +259,8 @@ def _shifted_pair(potential, i, j, r2):
 
 
 def damped_self_energy(potential: DampedShiftedForce, position: np.ndarray) -> float:
-    """Energy (u Å²/ps²) of the charges of one molecule with the neutralising images of damped shifted force.
-
-    position (s, 3) of the charged sites of the molecule, in the order of the first s of potential.charge. Each charge
-    interacts with its image (Fennell & Gezelter 2006) and with the images of its molecule, for which the pair loop has
-    no pairs. The energy is constant for a rigid body.
-    """
+    """Energy (u Å²/ps²) of the charges of one molecule with the neutralising images of damped shifted force. position
+    (s, 3) of the charged sites of the molecule, in the order of the first s of potential.charge."""
     charge = potential.charge[: len(position)]
     energy = (0.5 * potential.shift - potential.alpha / sqrt(pi)) * charge @ charge
     for i in range(len(position)):

@@ -1,22 +1,10 @@
 """Truncation of a pair potential at its cutoff: plain, shift, force_shift, force_switch, switch or smooth_switch.
 
-A pair potential is a sum of radial parts v(r). Inside the cutoff, v(r) becomes
+Inside the cutoff a radial part v(r) becomes v(r) S(r) with a switch S, or else, with p added to the force -v',
 
     v(r) + constant - integral of p(x) dx,   x = r - start,   p(x) = linear + quadratic x² + cubic x³   (r > start)
 
-so p is added to the force -v'. With `switch` and `smooth_switch` it becomes v(r) S(r) with S falling from 1 to 0.
-
-| name | what it does | continuous at the cutoff |
-|---|---|---|
-| plain | nothing | nothing |
-| shift | adds a constant (GROMACS potential-shift) | energy |
-| force_shift | subtracts a linear term from the start | energy, force |
-| force_switch | adds a cubic to the force beyond `start` (GROMACS) | energy, force, its derivative |
-| switch | multiplies the energy by a quintic beyond `start` (OpenMM) | energy, force, its derivative |
-| smooth_switch | multiplies the energy by a polynomial of degree 9 beyond `start` | also three more derivatives |
-
-An integrator reaches its order only if the forces have enough derivatives. In liquid water, integrators of order 4 and
-6 fall to about order 3 with `switch`; with `smooth_switch` from 5 to 9 Å they keep 4.0 and 6.
+See the theory chapter `interactions` for the formulas, for what is continuous, and for the order that integrators keep.
 """
 
 from collections.abc import Callable

@@ -29,20 +29,9 @@ JUMPS = (-1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 
 
 class EnergyWalk(NamedTuple):
-    """The random walk of the energy that truncated forces cause, for any integrator and step.
-
-    Where pairs cross a distance at which the k-th derivative of their force jumps, the variance of the energy grows as
-    D t (docs/theory/errors.md), with the kicks b_i at the times c_i dt:
-
-        D = scale w dt^(2k+2),    w = sum_n |sum_i b_i exp(2 pi i n c_i)|² / n^(2k+2)
-
-    with a scale of the scene that no integrator changes. `switch` has k = 2, `shift` 0, `smooth_switch` 4, but acts as
-    5 at 2 to 8 fs; single precision of the forces acts as k = -1/2. In 27 SPC/E waters D of srkn_4 at 8, 4 and 2 fs was
-    2e-7, 1.7e-9 and 2.3e-11 kT²/ps per degree of freedom with `switch`; D of srkn_4 over D of srkn_6 at 4 fs was 34
-    with `switch` (here 41) and 970 with `smooth_switch` (885).
-
-    D is in squares of the energy unit of a `TrialSystem` per unit of time of its span.
-    """
+    """The random walk of the energy that truncated forces cause, for any integrator and step. See "Energy drift and its
+    error" in the theory chapter `errors`: D = scale w dt^(2k+2), with a scale of the scene that no integrator changes.
+    D is in squares of the energy unit of a `TrialSystem` per unit of time of its span."""
 
     scale: float
     jump: float  # the derivative of the force that jumps

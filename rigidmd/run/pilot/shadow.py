@@ -1,8 +1,5 @@
-"""The bias of averages by the time step, from the shadow Hamiltonian; by it "auto" chooses a step for bias_kT.
-
-docs/theory/errors.md derives the formulas. In a liquid the two parts of the bias of BAOAB do not cancel, and it is
-taken to be one of them.
-"""
+"""The bias of averages by the time step, from the shadow Hamiltonian; by it "auto" chooses a step for bias_kT. See "The
+bias of averages" in the theory chapter `errors`."""
 
 from dataclasses import replace
 from math import inf, isfinite, sqrt
