@@ -130,7 +130,7 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     figure = new_figure(8, 6.4, title="Euler angles (3-1-3)")
     beyond_turn = [np.ptp(angle) > 360 for angle in angles]
     drawn = [angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)]
-    labels = [f"{name} ({'text' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
+    labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
     cells = figure.add_gridspec(3, 1)
     panels = _draw_series(figure, cells, time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
