@@ -501,6 +501,7 @@ def test_adding_an_integrator_from_python(monkeypatch):
         ({"kicks": [0.5, 0.5]}, "needs steps, or kicks and drifts"),
         ({"kicks": [0.5, 0.5], "drifts": [0.5, 0.5]}, "kicks must be one more than drifts"),
         ({"kicks": [0.5, float("nan")], "drifts": [1.0]}, "kicks.1"),
+        ({"kicks": [0.5, 0.0, 0.5], "drifts": [0.5, 0.5], "gradients": [0, 0.1, 0]}, "fraction 0 has no gradient"),
         ({"steps": [1.0], "name": "srkn_4"}, "srkn_4 is an integrator of rigidmd"),
         ({"steps": [1.0], "name": "my row"}, "name: is 'my row'"),
         ({"steps": [1e5, -1e5, 1.0]}, "steps.0: is 100000.0, must not be more than 10"),

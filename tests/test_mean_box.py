@@ -114,3 +114,10 @@ def test_check_and_exports_know_of_it(tmp_path, capsys):
     assert cli.main(["export", str(path), "--to", "gromacs", "-o", str(tmp_path / "out")]) == 2
     assert "stages.1.volume = 'mean' stays with rigidmd" in capsys.readouterr().err
     assert Scene.read(path).stages[1].volume == "mean"
+
+
+def test_a_scene_that_begins_with_a_minimisation_settles_before_any_sample():
+    """As an export does."""
+    stages = [{"ensemble": "minimise"}, {"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.1}]
+    simulation = Simulation(small_scene({"argon": 40}, 20.0, stages=stages, start={"temperature_K": 90.0}))
+    assert np.isfinite(simulation.settle().position).all()

@@ -237,7 +237,8 @@ class MolecularRun(RunPart):
         record.moves[record.position.segment] = self.engine.moves or (0, 0)
         record.position.segment = k
         was_auto, moves = self.scene.stages[k].is_auto, not self.scene.stages[k].is_minimisation
-        scale_to_mean_box(self.system, self.state, self.samples(), k)
+        if self.scene.stages[k].volume:
+            scale_to_mean_box(self.system, self.state, self.samples(), k)
         if was_auto:
             self._choose(k)
         if moves:

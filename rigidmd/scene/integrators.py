@@ -45,6 +45,8 @@ class IntegratorRow(Section):
             yield "needs steps, or kicks and drifts"
         elif self.steps is not None and (self.kicks or self.drifts or self.gradients):
             yield "steps and kicks, drifts or gradients contradict each other: omit one"
+        elif any(g and not kick for g, kick in zip(self.gradients or (), self.kicks or (), strict=False)):
+            yield "gradients: a kick of fraction 0 has no gradient: its coefficient is multiplied by the fraction"
         else:
             try:
                 order = measured_order(self.scheme)

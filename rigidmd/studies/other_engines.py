@@ -53,7 +53,11 @@ def export(scene: Scene, to: str, folder: Path, force: bool = False) -> Exported
         for k, stage in enumerate(system.scene.stages)
         if stage.is_minimisation and any(not before.is_minimisation for before in system.scene.stages[:k])
     ]
-    scaled = [f"stages.{k}.volume = 'mean' stays with rigidmd" for k, s in enumerate(system.scene.stages) if s.volume]
+    scaled = [
+        f"stages.{k}.volume = 'mean' stays with rigidmd: omit it, or export that stage with the final state of "
+        "the stage before as [structure]"
+        for k, stage in enumerate(system.scene.stages) if stage.volume
+    ]  # fmt: skip
     view = checked_view(system, program, program.title, [*later, *scaled])
     state = start_of(system)
     with writing(folder):
