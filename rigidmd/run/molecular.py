@@ -262,7 +262,15 @@ class MolecularRun(RunPart):
         k = self.record.position.segment
         stage = self.scene.stages[k]
         with progress_of(stage.most_iterations, "iterations", progress, self.simulation.spot) as bar:
-            found = minimise(self.system, self.state, stage, self.simulation.must_end, bar.update)
+
+            def advance(count: float) -> None:
+                if bar.n:
+                    bar.update(count)
+                else:  # the first iteration compiles
+                    bar.unpause()
+                    bar.skip(count)
+
+            found = minimise(self.system, self.state, stage, self.simulation.must_end, advance)
         self.engine.forget()
         self.record.minima[k] = found
         if not found.converged:
