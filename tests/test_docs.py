@@ -54,8 +54,10 @@ from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 
 README = ROOT / "README.md"
-DOCUMENTS = [README, *CHAPTERS.values()]
-MANUAL = "\n".join(path.read_text(encoding="utf-8") for path in CHAPTERS.values() if path.parent.name == "reference")
+#: The chapters of this checkout; those of an installed package may be elsewhere.
+PAGES = {name: ROOT / "rigidmd" / "docs" / path.relative_to(DOCS) for name, path in CHAPTERS.items()}
+DOCUMENTS = [README, *PAGES.values()]
+MANUAL = "\n".join(path.read_text(encoding="utf-8") for path in PAGES.values() if path.parent.name == "reference")
 LANGUAGES = {"sh", "python", "toml", "text", "bibtex"}
 MINIMAL = {
     MolecularScene: {
@@ -413,8 +415,8 @@ def test_links_and_pictures_are_there(document):
 def test_readme_is_a_first_page_and_leads_to_every_chapter():
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 130
-    for name in CHAPTERS:
-        assert f"({CHAPTERS[name].relative_to(ROOT)})" in text
+    for path in PAGES.values():
+        assert f"({path.relative_to(ROOT)})" in text
 
 
 def test_author_and_version_are_the_same_wherever_they_are_said():
@@ -425,7 +427,7 @@ def test_author_and_version_are_the_same_wherever_they_are_said():
     assert f"{{{{{author['name']}}}}}" in text
     assert f"version {version}," in text
     assert f"version = {{{version}}}" in text
-    assert f"\n## {version}" in CHAPTERS["changelog"].read_text(encoding="utf-8")
+    assert f"\n## {version}" in PAGES["changelog"].read_text(encoding="utf-8")
     zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
     found = [zenodo[key] for key in ("version", "keywords", "license", "creators")]
     assert found == [version, project["keywords"], project["license"], [{"name": author["name"]}]]
@@ -436,7 +438,7 @@ def test_help_lists_and_prints_the_chapters(capsys):
     assert cli.main(["help"]) == 0
     listed = re.sub(r"\n {18}", " ", capsys.readouterr().out)
     for name in CHAPTERS:
-        source = CHAPTERS[name].read_text(encoding="utf-8")
+        source = PAGES[name].read_text(encoding="utf-8")
         about = source.splitlines()[2]
         assert about.endswith(".")
         assert len(about) <= 120
@@ -447,7 +449,7 @@ def test_help_lists_and_prints_the_chapters(capsys):
         assert "<!--" not in said
         assert "![" not in said
         with contextlib.suppress(StopIteration):
-            code = next(block for block in blocks_of(CHAPTERS[name]) if block.language == "sh")
+            code = next(block for block in blocks_of(PAGES[name]) if block.language == "sh")
             assert re.sub(r"systems/(?=\w+\.toml)", "", code.text) in said
         for stem, ending in re.findall(r"systems/(?:scripts/|notebooks/)?(\w+)(\.toml|\.py|\.ipynb)", source):
             assert find_example(stem).path.suffix == ending  # `rigidmd new` copies it
@@ -498,9 +500,9 @@ def test_the_table_of_integrators_has_their_orders_and_costs():
 
 def test_the_page_of_models_has_the_tables_of_their_files():
     """`python tests/test_docs.py` writes them."""
-    assert CHAPTERS["models"].read_text(encoding="utf-8").endswith("\n" + models_tables())
+    assert PAGES["models"].read_text(encoding="utf-8").endswith("\n" + models_tables())
 
 
 if __name__ == "__main__":
-    text = CHAPTERS["models"].read_text(encoding="utf-8")
-    CHAPTERS["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
+    text = PAGES["models"].read_text(encoding="utf-8")
+    PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")

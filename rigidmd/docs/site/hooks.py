@@ -13,9 +13,9 @@ from pathlib import Path
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
-from rigidmd.core.shipped import DOCS, SECTIONS
+from rigidmd.core.shipped import SECTIONS
 
-README = DOCS.parents[1] / "README.md"
+README = Path(__file__).parents[3] / "README.md"
 #: Live pages: scene, options of the run.
 LIVE = {
     "heavy_top_3": (), "intermediate_axis": (), "dry_ice": ("--set", "output.trajectory_interval_ps=0.1"),
