@@ -852,7 +852,11 @@ def test_what_energy_says_of_its_figures():
     [
         ("plain", "q q (1/r + k r²) up to the cutoff"),
         ("switch", "q q (1/r + k r²) up to the cutoff, less its value at the cutoff, times switch from 5.4 Å on"),
-        ("force_switch", "q q (1/r + k r²) up to the cutoff, its force switched off from 5.4 Å on"),
+        pytest.param(
+            "force_switch",
+            "q q (1/r + k r²) up to the cutoff, its force switched off from 5.4 Å on",
+            marks=pytest.mark.soak,
+        ),
     ],
 )
 def test_what_energy_says_of_a_reaction_field(truncation, words, capsys, tmp_path):

@@ -71,7 +71,12 @@ def energies(engine, state):
 @pytest.mark.parametrize(
     ("ending", "counts", "edge"),
     [
-        pytest.param(ending, *which, id=f"{ending}-{k}", marks=[] if k == 1 or ending == "switch" else pytest.mark.soak)
+        pytest.param(
+            ending,
+            *which,
+            id=f"{ending}-{k}",
+            marks=[] if (k == 1 and ending != "force_shift") or ending == "switch" else pytest.mark.soak,
+        )
         for ending in ENDINGS
         for k, which in enumerate(MIXTURES)
     ],

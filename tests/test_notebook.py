@@ -249,7 +249,7 @@ def test_the_film_of_molecules_is_a_widget(tmp_path):
 
 def test_without_chemiscope_one_sentence_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "chemiscope", None)
-    with pytest.raises(ImportError, match=r"needs the extra rigidmd\[view\]: pip install chemiscope"):
+    with pytest.raises(ImportError, match=r"needs chemiscope: pip install chemiscope"):
         rigidmd.view.show(argon().run())
 
 

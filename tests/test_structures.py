@@ -260,7 +260,7 @@ REFERENCE = [
     ("structures/H2O_ice_Ih.cif", "tip4p2005", inf, 12, density(12, WATER, ICE_IH_VOLUME), 0.0843, 0.1305, "built from"),
     ("structures/H2O_ice_Ih.cif", "spce", inf, "is not spce: an atom is 0.173 Å from the rigid template"),
     ("awkward/two_water_gro.gro", "spce", None, 2, density(2, WATER, 100.0**3), 0.0041, 0.0063, ""),
-    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 are no elements"),
+    ("awkward/two_water_gro_nonames.gro", "spce", None, 2, 5.983e-5, 0.0041, 0.0063, "A, B1, B2 are not elements"),
     (
         "awkward/two_water_gro_widebox.gro", "spce", None,
         2, density(2, WATER, 76.4092 * 79.1768 * 73.1922), 0.0041, 0.0063, "",

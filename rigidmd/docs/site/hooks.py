@@ -19,7 +19,7 @@ README = Path(__file__).parents[3] / "README.md"
 #: Live pages: scene, options of the run.
 LIVE = {
     "heavy_top_3": (), "intermediate_axis": (), "dry_ice": ("--set", "output.trajectory_interval_ps=0.1"),
-    "water": ("--set", "output.trajectory_interval_ps=0.5"),
+    "water": ("--set", "stages.production.duration_ps=2", "--set", "output.trajectory_interval_ps=0.1"),
 }  # fmt: skip
 API = ("rigidmd", "rigidmd.view", "rigidmd.analysis", "rigidmd.ase", "rigidmd.errors")
 CSS = """math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", "DejaVu Math TeX Gyre", math; }
