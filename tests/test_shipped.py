@@ -120,7 +120,7 @@ def test_what_cannot_be_copied_is_said(arguments, expected, tmp_path, monkeypatc
     assert [path.name for path in tmp_path.rglob("*")] == ["file"]
 
 
-@pytest.mark.parametrize("arguments", [["examples"], ["help"], ["help", "manual"]])
+@pytest.mark.parametrize("arguments", [["examples"], ["help"], ["help", "scene"]])
 def test_what_only_prints_is_quick_and_imports_nothing_heavy(arguments):
     code = f"import sys; from rigidmd.commands.cli import main\nmain({arguments})\nprint(sorted({{'numba', 'numpy', 'ase', 'MDAnalysis', 'pydantic'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
