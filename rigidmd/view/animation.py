@@ -17,8 +17,8 @@ from rigidmd.view import plots
 from rigidmd.view.run_page import animation_of
 
 EXTENSIONS = (".mp4", ".gif")
-#: Frames per second, length in seconds, and height in pixels of an animation; inches of its picture.
-#: Frames per second: of a .gif, whose times are whole hundredths of a second, s; pixels.
+#: Frames per second, length in seconds, and height in pixels of an animation; inches of its picture. A frame of a .gif
+#: lasts a whole number of hundredths of a second.
 RATE, SECONDS, HEIGHT = {".mp4": 25, ".gif": 12.5}, 10.0, {".mp4": 640, ".gif": 448}
 INCHES = 6.4
 #: Most panels next to an animation.

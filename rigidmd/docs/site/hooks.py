@@ -96,9 +96,7 @@ def _entry(rank: str, name: str, member: object) -> list[str]:
 def _live_page(name: str) -> Path:
     """The page that `rigidmd view` writes of a run of a shipped scene."""
     folder = Path(tempfile.mkdtemp())
-    for command in (("run", f"{name}.toml", "-o", "run", *LIVE[name]), ("view", "run")):
-        if command[0] == "run":
-            subprocess.run([sys.executable, "-m", "rigidmd", "new", name], cwd=folder, check=True)
+    for command in (("new", name), ("run", f"{name}.toml", "-o", "run", *LIVE[name]), ("view", "run")):
         subprocess.run([sys.executable, "-m", "rigidmd", *command], cwd=folder, check=True)
     return next((folder / "run").glob("*.html"))
 

@@ -73,7 +73,8 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
 
 
 def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> float:
-    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1."""
+    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1; 1 for charges without size.
+    A dilute box may contain such a cluster, so its errors are those of this density."""
     filled = 0.0
     for m, n in zip(species, map(int, counts), strict=True):
         filled += n * (2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma)) ** 3
