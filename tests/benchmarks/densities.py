@@ -15,11 +15,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from peer_engines import Gromacs, call, environment, gro, program, top
+from peer_engines import Gromacs, call, environment, gro, program, sites_of, top
 from pymbar import timeseries
 
 from rigidmd import Scene, Simulation
-from rigidmd.units import KJ_PER_MOL
 
 COUNT, CUTOFF, TEMPERATURE, STEP = 512, 9.0, 298.15, 2.0  # Å, K, fs
 EVERY = 0.1  # ps between samples
@@ -53,18 +52,7 @@ def begin_gromacs(model: str, duration: float, folder: Path) -> subprocess.Popen
     nvt = {"ensemble": "nvt", "duration_ps": 5.0}
     simulation = Simulation(Scene.from_dict(scene(model, nvt)))
     state = simulation.run().state
-    system = simulation.system
-    species = system.species[0]
-    sites = {
-        "position": system.site_positions(state, wrapped=True).reshape(COUNT, -1, 3),
-        "template": species.positions_body,
-        "edge": state.cell[0, 0],
-        "name": species.site_names,
-        "mass": species.masses,
-        "charge": species.charges,
-        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
-        "epsilon": species.epsilon / KJ_PER_MOL,
-    }
+    sites = sites_of(simulation.system, state)
     every = round(EVERY / (STEP * 1e-3))
     options = {
         "integrator": "md", "dt": STEP * 1e-3, "nsteps": round(duration / (STEP * 1e-3)), "gen-vel": "yes",

@@ -135,30 +135,12 @@ class OpenMM:
 
         n, s = sites["position"].shape[:2]
         cutoff = job["workload"]["cutoff"] / 10
-        system = openmm.System()
-        edge = float(sites["edge"]) / 10
-        system.setDefaultPeriodicBoxVectors((edge, 0, 0), (0, edge, 0), (0, 0, edge))
-        force = openmm.NonbondedForce()
+        system, force = openmm_system(sites, cutoff, job["options"].get("switch_A"))
         method = "PME" if job["workload"]["pme"] else "CutoffPeriodic"
         force.setNonbondedMethod(getattr(openmm.NonbondedForce, method))
         force.setEwaldErrorTolerance(OPENMM_TOLERANCE)
-        force.setCutoffDistance(cutoff)
         force.setUseDispersionCorrection(False)
         force.setReactionFieldDielectric(job["workload"]["permittivity"])
-        if width := job["options"].get("switch_A"):
-            force.setUseSwitchingFunction(True)
-            force.setSwitchingDistance(cutoff - width / 10)
-        for i in range(n * s):
-            k = i % s
-            system.addParticle(sites["mass"][k])
-            force.addParticle(sites["charge"][k], sites["sigma"][k] / 10, sites["epsilon"][k])
-        template = sites["template"] / 10
-        for first in range(0, n * s, s):
-            for j in range(s):
-                for i in range(j):
-                    system.addConstraint(first + i, first + j, np.linalg.norm(template[i] - template[j]))
-                    force.addException(first + i, first + j, 0, 1, 0)
-        system.addForce(force)
         integrator = openmm.VerletIntegrator(job["timestep_fs"] * 1e-3)
         platform = openmm.Platform.getPlatformByName("CPU")
         context = openmm.Context(system, integrator, platform, {"Threads": str(job["cores"])})
@@ -300,6 +282,49 @@ class Lammps:
 
 
 ENGINES = {"rigidmd": Rigidmd, "gromacs": Gromacs, "openmm": OpenMM, "lammps": Lammps}
+
+
+def openmm_system(sites: dict, cutoff: float, switch: float | None):
+    """A system of rigid molecules in a cube and its NonbondedForce. cutoff in nm; switch : width of the switch before it, Å"""
+    import openmm
+
+    n, s = sites["position"].shape[:2]
+    system, force = openmm.System(), openmm.NonbondedForce()
+    edge = float(sites["edge"]) / 10
+    system.setDefaultPeriodicBoxVectors((edge, 0, 0), (0, edge, 0), (0, 0, edge))
+    force.setCutoffDistance(cutoff)
+    if switch:
+        force.setUseSwitchingFunction(True)
+        force.setSwitchingDistance(cutoff - switch / 10)
+    for i in range(n * s):
+        k = i % s
+        system.addParticle(sites["mass"][k])
+        force.addParticle(sites["charge"][k], sites["sigma"][k] / 10, sites["epsilon"][k])
+    template = sites["template"] / 10
+    for first in range(0, n * s, s):
+        for j in range(s):
+            for i in range(j):
+                system.addConstraint(first + i, first + j, np.linalg.norm(template[i] - template[j]))
+                force.addException(first + i, first + j, 0, 1, 0)
+    system.addForce(force)
+    return system, force
+
+
+def sites_of(system, state) -> dict:
+    """Sites of a state of rigidmd with one species, and their parameters, as all engines here take them; Å, u, e, kJ/mol."""
+    from rigidmd.units import KJ_PER_MOL
+
+    species = system.species[0]
+    return {
+        "position": system.site_positions(state, wrapped=True).reshape(len(state.position), -1, 3),
+        "template": species.positions_body,
+        "edge": np.array(state.cell[0, 0]),
+        "name": np.array(species.site_names),
+        "mass": species.masses,
+        "charge": species.charges,
+        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
+        "epsilon": species.epsilon / KJ_PER_MOL,
+    }
 
 
 def pieces(job: dict) -> list[int]:

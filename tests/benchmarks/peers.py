@@ -44,7 +44,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
-from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy, environment
+from peer_engines import DSF_ALPHA, ENGINES, OPENMM_TOLERANCE, Absent, busy, environment, sites_of
 from scipy.spatial import cKDTree
 from scipy.special import erfc
 
@@ -283,17 +283,9 @@ def describe(work: Workload, folder: Path) -> Start:
     kicked.velocity[:] += load.force / species.mass
     kicked.angular_momentum_body[:] += load.torque_body * (species.inertia > 0)
     velocity = system.site_velocities(state)
-    sites = {
-        "position": system.site_positions(state, wrapped=True).reshape(shape),
+    sites = sites_of(system, state) | {
         "velocity": velocity.reshape(shape),
         "kick": (system.site_velocities(kicked) - velocity).reshape(shape),
-        "template": species.positions_body,
-        "edge": np.array(work.edge),
-        "name": np.array(species.site_names),
-        "mass": species.masses,
-        "charge": species.charges,
-        "sigma": np.where(species.epsilon > 0, species.sigma, 1.0),
-        "epsilon": species.epsilon / KJ_PER_MOL,
     }
     potentials["RF without self"] = potentials["RF"] - own
     if work.pme:  # LAMMPS sums over k with the pairs inside molecules, and takes none of them out

@@ -1,0 +1,456 @@
+"""What an average costs: total error against computing time, for methods of rigidmd, GROMACS and OpenMM.
+
+    python tests/benchmarks/sampling.py runs/sampling --rounds 4
+    python tests/benchmarks/sampling.py runs/sampling --collect --json sampling.json --figure sampling.png
+
+512 SPC/E waters at 298.15 K; cut-off 9 Å, Lennard-Jones switched over the last Å with tail corrections, PME. All engines have
+the same forces, one thread, and otherwise the settings that their users have: the step, the integrator and the coupling
+differ. Averages: U, the height of the first peak of g(r) of oxygens and D at 0.997 g/cm³, and the density at 1 bar.
+
+Many short runs (6 ps to relax, 48 ps sampled) from a few starts, in rounds of all methods and steps; each leaves a small file,
+so that the command goes on where it was stopped, and several of them share the work: `--next N` does N runs and fails
+if none is left. Then, of each average,
+
+- the bias of a method at a step: its mean less the limit of all engines and methods at a step of zero, one weighted fit
+  linear in dt² (`extrapolate`);
+- the variance of a mean over 1 ns: from the scatter of the runs of a method about the mean at their step;
+- the cost: seconds of a processor (user and system) per ns, a median over runs. It hardly depends on what else runs.
+
+The total error after a time t is sqrt(bias² + variance / t); of the square of a bias that of its error is taken off.
+"""
+
+import argparse
+import json
+import resource
+import sys
+import tempfile
+import time
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from peer_engines import Failed, Gromacs, OpenMM, Rigidmd, call, gro, openmm_system, program, sites_of, top
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from support import FAINT, INK, MeanAtStep, extrapolate
+
+from rigidmd import Every, Scene, Simulation
+from rigidmd.errors import RigidMDError
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+COUNT, TEMPERATURE, DENSITY, CUTOFF, SWITCH = 512, 298.15, 0.997, 9.0, 1.0  # K, g/cm³, Å
+EVERY, RELAXED, FRAMES = 0.12, 50, 450  # ps between frames; frames to relax, and all of a run
+NS = (FRAMES - RELAXED) * EVERY * 1e-3  # sampled by a run
+STARTS = 4
+PEAK = (2.70, 2.80)  # Å, the shell around the first maximum of g(r) in which its height is averaged
+LAGS = (2.0, 8.0)  # ps between which the mean square displacement is taken as a straight line
+KT_PER_FREEDOM = 6 * BOLTZMANN * TEMPERATURE / KJ_PER_MOL  # of a molecule, kJ/mol
+RARE = 1.0  # fs: this step is run in one of four rounds only
+
+
+class Quantity(NamedTuple):
+    title: str
+    unit: str
+    scale: float  # of errors; 0: the limit
+    ensemble: str
+    targets: tuple[float, float]  # of the total error, in the unit of errors
+    error_unit: str
+
+
+QUANTITIES = {
+    "U": Quantity("potential energy", "kJ/mol", KT_PER_FREEDOM, "nvt", (0.01, 0.002), "kT per degree of freedom"),
+    "density": Quantity("density at 1 bar", "g/cm³", 0.0, "npt", (0.002, 0.001), "fraction"),
+    "peak": Quantity("first peak of g(r)", "", 1.0, "nvt", (0.02, 0.005), "of its height, 3.0"),
+    "D": Quantity("diffusion coefficient", "1e-5 cm²/s", 0.0, "nvt", (0.05, 0.02), "fraction"),
+}
+
+
+class Method(NamedTuple):
+    engine: str
+    color: str
+    steps: tuple[float, ...]  # fs
+    dense: tuple[float, ...]  # fs, with a barostat
+    options: dict  # of the stage, or of the .mdp file
+    motion: bool = True  # whether it keeps the motion that D belongs to
+
+
+RESCALING, LANGEVIN = {"thermostat": "velocity_rescaling"}, {"thermostat": "langevin"}
+METHODS = {
+    "velocity_verlet + velocity_rescaling": Method(
+        "rigidmd", "#2b7fb8", (1, 2, 4, 6, 8), (2, 4), RESCALING | {"integrator": "velocity_verlet"}),
+    "velocity_verlet + nose_hoover": Method(
+        "rigidmd", "#8fb4cf", (4, 8), (), {"integrator": "velocity_verlet", "thermostat": "nose_hoover"}),
+    "baoab + velocity_rescaling": Method(
+        "rigidmd", "#123d5c", (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}),
+    "baoab + langevin": Method("rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False),
+    "srkn_4 + velocity_rescaling": Method("rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}),
+    "GROMACS md + v-rescale": Method(
+        "gromacs", "#c8553d", (1, 2, 4), (2, 4),
+        {"integrator": "md", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.1, "ref-t": TEMPERATURE}),
+    "GROMACS sd": Method(
+        "gromacs", "#e2a08f", (2, 4), (),
+        {"integrator": "sd", "tc-grps": "system", "tau-t": 1.0, "ref-t": TEMPERATURE}, False),
+    "OpenMM LangevinMiddle": Method("openmm", "#4f8a5b", (1, 2, 4), (4,), {}, False),
+}  # fmt: skip
+
+
+class Run(NamedTuple):
+    ensemble: str
+    method: str
+    step: float  # fs
+    round: int
+
+    def file(self, folder: Path) -> Path:
+        name = self.method.replace(" + ", "+").replace(" ", "-")
+        return folder / f"{self.ensemble}-{name}-{self.step:g}fs-{self.round}.json"
+
+
+def runs(rounds: int) -> list[Run]:
+    """All runs, round by round."""
+    found = []
+    for number, ensemble in product(range(rounds), ("nvt", "npt")):
+        for name, method in METHODS.items():
+            steps = method.steps if ensemble == "nvt" else method.dense
+            found += [Run(ensemble, name, step, number) for step in steps if step > RARE or number % STARTS == 0]
+    return found
+
+
+def scene(stage: dict, seed: int = 1, start: bool = True) -> dict:
+    """The liquid with one stage, in the folder of its start."""
+    return {
+        "box": None if start else {"density_g_cm3": DENSITY},
+        "structure": {"file": "start.npz"} if start else None,
+        "molecules": [{"model": "spce", "count": COUNT}],
+        "forces": {"cutoff_A": CUTOFF, "truncation": "switch", "switch_start_A": CUTOFF - SWITCH,
+                   "electrostatics": "pme", "ewald_cutoff_A": CUTOFF, "ewald_truncation": "plain"},
+        "precision": "mixed", "threads": 1, "seed": seed, "start": {"temperature_K": TEMPERATURE},
+        "stages": [{"temperature_K": TEMPERATURE} | stage],
+        "output": {"trajectory": False, "figures": False, "log_interval_ps": EVERY},
+    }  # fmt: skip
+
+
+def simulate(data: dict, folder: Path, **options) -> Simulation:
+    whole = {key: value for key, value in data.items() if value is not None}
+    return Simulation(Scene.from_dict(whole, folder), warn=lambda warning: None, **options)
+
+
+def make_starts(folder: Path) -> None:
+    """STARTS states of the liquid, 12 ps apart, in folder/start0, start1, ...: start.npz of rigidmd, sites.npz of all sites."""
+    from peers import WORKLOADS, write_start
+
+    stage = {"ensemble": "nvt", "integrator": "baoab", "thermostat": "langevin", "timestep_fs": 2.0}
+    simulation = simulate(scene(stage | {"duration_ps": 12.0 * (1 + STARTS)}, start=False), folder)
+    for k in range(-1, STARTS):
+        simulation.step(6000)
+        if k >= 0:
+            state, system = simulation.state, simulation.system
+            (folder / f"start{k}").mkdir(exist_ok=True)
+            write_start(folder / f"start{k}", WORKLOADS["W2"], state.position, state.velocity, state.rotation,
+                        state.angular_momentum_body, state.cell[0, 0])  # fmt: skip
+            np.savez(folder / f"start{k}" / "sites.npz", **sites_of(system, state))
+
+
+# Each engine: the series (FRAMES + 1) of U in kJ/mol and density in g/cm³, positions (FRAMES + 1, COUNT, 3) of oxygens and
+# edges of the box in Å, and seconds of a processor per ns
+
+
+def run_rigidmd(run: Run, folder: Path, start: Path) -> tuple:
+    frames, clock = [], []
+
+    def look(moment):
+        clock.append(time.process_time())
+        frames.append(np.array(moment.site_positions[::3]))
+
+    stage = METHODS[run.method].options | {"ensemble": run.ensemble, "timestep_fs": run.step}
+    stage |= {"duration_ps": FRAMES * EVERY} | ({"pressure_bar": 1.0} if run.ensemble == "npt" else {})
+    simulation = simulate(scene(stage, 1 + run.round), start, observers=Every(EVERY, look))
+    results = simulation.run(progress=False)
+    edges = (COUNT * simulation.system.species[0].mass / 0.602214076 / results["density"]) ** (1 / 3)
+    cost = (clock[-1] - clock[RELAXED]) / NS
+    return results["potential"], results["density"], np.array(frames), edges, cost
+
+
+def run_gromacs(run: Run, folder: Path, start: Path) -> tuple:
+    from MDAnalysis.coordinates.XTC import XTCReader
+
+    sites = dict(np.load(start / "sites.npz"))
+    every = round(1000 * EVERY / run.step)
+    options = {
+        "dt": run.step * 1e-3, "nsteps": FRAMES * every, "gen-vel": "yes", "gen-temp": TEMPERATURE,
+        "gen-seed": 1 + run.round, "ld-seed": 1 + run.round, "rvdw": CUTOFF / 10, "rcoulomb": CUTOFF / 10,
+        "vdw-modifier": "potential-switch", "rvdw-switch": (CUTOFF - SWITCH) / 10, "DispCorr": "AllEnerPres",
+        "coulombtype": "PME", "coulomb-modifier": "none", "nstenergy": every, "nstcalcenergy": every, "nstlog": 0,
+        "nstxout-compressed": every, "compressed-x-precision": 10000,
+    } | METHODS[run.method].options  # fmt: skip
+    if run.ensemble == "npt":
+        options |= {"pcoupl": "C-rescale", "tau-p": 1.0, "ref-p": 1.0, "compressibility": 4.5e-5}
+    (folder / "run.mdp").write_text("".join(f"{key} = {value}\n" for key, value in options.items()))
+    (folder / "run.gro").write_text(gro(sites, np.zeros_like(sites["position"])))
+    (folder / "run.top").write_text(top(sites))
+    gmx = [program("gmx"), "-quiet", "-nobackup"]
+    call([*gmx, "grompp", "-f", "run.mdp", "-c", "run.gro", "-p", "run.top", "-o", "run.tpr", "-maxwarn", 1], folder)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    call([*gmx, "mdrun", "-deffnm", "run", "-notunepme", "-noconfout", "-ntmpi", 1, "-ntomp", 1], folder)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cost = (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / (FRAMES * EVERY * 1e-3)
+    wanted = "Potential\n" + ("Density\n" if run.ensemble == "npt" else "") + "\n"
+    call([*gmx, "energy", "-f", "run.edr", "-o", "run.xvg", "-dp"], folder, wanted)
+    lines = [line.split() for line in (folder / "run.xvg").read_text().splitlines() if line[0] not in "#@"]
+    table = np.array(lines, float)
+    density = 1e-3 * table[:, 2] if run.ensemble == "npt" else np.full(len(table), DENSITY)
+    with XTCReader(str(folder / "run.xtc")) as trajectory:
+        seen = [(frame.positions[::3].astype(float), float(frame.dimensions[0])) for frame in trajectory]
+    return table[:, 1], density, np.array([at for at, _ in seen]), np.array([edge for _, edge in seen]), cost
+
+
+def run_openmm(run: Run, folder: Path, start: Path) -> tuple:
+    import openmm
+
+    sites = dict(np.load(start / "sites.npz"))
+    system, force = openmm_system(sites, CUTOFF / 10, SWITCH)
+    force.setNonbondedMethod(openmm.NonbondedForce.PME)
+    if run.ensemble == "npt":
+        barostat = openmm.MonteCarloBarostat(1.0, TEMPERATURE)
+        barostat.setRandomNumberSeed(1 + run.round)
+        system.addForce(barostat)
+    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 1.0, run.step * 1e-3)
+    integrator.setRandomNumberSeed(1 + run.round)
+    platform = openmm.Platform.getPlatformByName("CPU")
+    context = openmm.Context(system, integrator, platform, {"Threads": "1"})
+    context.setPositions(sites["position"].reshape(-1, 3) / 10)
+    context.setVelocitiesToTemperature(TEMPERATURE, 1 + run.round)
+    mass, rows, frames = sites["mass"].sum() * COUNT / 602.214076, [], []
+    for frame in range(FRAMES + 1):
+        if frame == RELAXED:
+            began = time.process_time()
+        state = context.getState(getEnergy=True, getPositions=True)
+        volume = state.getPeriodicBoxVolume()._value
+        rows.append((state.getPotentialEnergy()._value, mass / volume, 10 * volume ** (1 / 3)))
+        frames.append(10 * state.getPositions(asNumpy=True)._value[::3])
+        if frame < FRAMES:
+            integrator.step(round(1000 * EVERY / run.step))
+    cost = (time.process_time() - began) / NS
+    energy, density, edges = np.array(rows).T
+    return energy, density, np.array(frames), edges, cost
+
+
+def peak_height(frames: np.ndarray, edges: np.ndarray) -> float:
+    """g(r) of oxygens in the shell PEAK."""
+    shell = 4 / 3 * np.pi * (PEAK[1] ** 3 - PEAK[0] ** 3)
+    found = []
+    for at, edge in zip(frames, edges, strict=True):
+        tree = cKDTree(np.mod(at, edge) % edge, boxsize=edge)
+        pairs = np.diff(tree.count_neighbors(tree, PEAK))[0]
+        found.append(pairs * edge**3 / (COUNT * (COUNT - 1) * shell))
+    return float(np.mean(found))
+
+
+def diffusion(frames: np.ndarray, edge: float) -> float:
+    """D in 1e-5 cm²/s from the slope of the mean square displacement of oxygens, less that of their mean."""
+    moves = np.diff(frames, axis=0)
+    path = np.cumsum(moves - edge * np.round(moves / edge), axis=0)
+    path -= path.mean(axis=1, keepdims=True)
+    lags = np.arange(round(LAGS[0] / EVERY), round(LAGS[1] / EVERY) + 1, 3)
+    squares = [np.mean(np.sum((path[lag:] - path[:-lag]) ** 2, axis=2)) for lag in lags]
+    return float(np.polyfit(lags * EVERY, squares, 1)[0] / 6 * 10)
+
+
+def do(run: Run, folder: Path) -> None:
+    """One run; its averages and cost, or why it failed, into its file."""
+    engine = METHODS[run.method].engine
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            function = {"rigidmd": run_rigidmd, "gromacs": run_gromacs, "openmm": run_openmm}[engine]
+            energy, density, frames, edges, cost = function(run, Path(scratch), folder / f"start{run.round % STARTS}")
+        except (Failed, RigidMDError) as error:
+            run.file(folder).write_text(json.dumps({"failure": str(error)[:300]}) + "\n")
+            return
+    late = slice(RELAXED, None)
+    found = {"cost_s_per_ns": cost, "U": float(np.mean(energy[late])) / COUNT}
+    if run.ensemble == "npt":
+        found["density"] = float(np.mean(density[late]))
+    else:
+        found |= {"peak": peak_height(frames[late], edges[late]), "D": diffusion(frames[late], edges[-1])}
+    run.file(folder).write_text(json.dumps(found) + "\n")
+
+
+def do_next(folder: Path, rounds: int) -> bool:
+    """The next run that no one has begun; False if there is none."""
+    for run in runs(rounds):
+        claim = run.file(folder).with_suffix(".begun")
+        if run.file(folder).exists():
+            continue
+        try:
+            claim.touch(exist_ok=False)
+        except FileExistsError:
+            continue
+        try:
+            do(run, folder)
+        finally:
+            claim.unlink()
+        print(
+            f"{time.strftime('%H:%M:%S')} {run.file(folder).stem}: {run.file(folder).read_text()}", end="", flush=True
+        )
+        return True
+    return False
+
+
+class Point(NamedTuple):
+    """An average by a method at a step; biases and errors are in units of the quantity's scale."""
+
+    method: str
+    step: float
+    count: int  # of runs
+    mean: float
+    error: float  # of the mean, in its own unit
+    bias: float
+    bias_error: float
+    cost: float  # s per ns
+    spread: float  # of the mean over 1 ns, statistical
+
+    def total_error(self, seconds):
+        return np.sqrt(max(0.0, self.bias**2 - self.bias_error**2) + self.spread**2 * self.cost / seconds)
+
+    def seconds_to(self, target: float) -> float:
+        """Computing time to a total error; infinite where the bias exceeds it."""
+        left = target**2 - max(0.0, self.bias**2 - self.bias_error**2)
+        return self.spread**2 * self.cost / left if left > 0 else np.inf
+
+
+def read(folder: Path) -> dict[tuple[str, str, float], list[dict]]:
+    """The runs that are there, by ensemble, method and step."""
+    found = {}
+    for run in runs(99):
+        if run.file(folder).exists():
+            result = json.loads(run.file(folder).read_text())
+            if "failure" in result:
+                print(f"{run.file(folder).stem} failed: {result['failure']}")
+            else:
+                found.setdefault((run.ensemble, run.method, run.step), []).append(result)
+    return found
+
+
+def analyse(name: str, found: dict) -> dict:
+    """Of a quantity its limit, those of the engines alone, variances of methods over that of all, and points."""
+    quantity = QUANTITIES[name]
+    values = {
+        (method, step): np.array([result[name] for result in results])
+        for (ensemble, method, step), results in found.items()
+        if ensemble == quantity.ensemble and (name != "D" or METHODS[method].motion)
+    }
+    squares, freedom = {}, {}
+    for (method, _), x in values.items():
+        squares[method] = squares.get(method, 0.0) + len(x) * x.var()
+        freedom[method] = freedom.get(method, 0) + len(x) - 1
+    variance = sum(squares.values()) / sum(freedom.values())
+    means = {key: MeanAtStep(*key, float(x.mean()), float(np.sqrt(variance / len(x)))) for key, x in values.items()}
+    fit = extrapolate(list(means.values()))
+    scale = quantity.scale or fit.limit
+    engines = {}
+    for engine in dict.fromkeys(METHODS[method].engine for method, _ in values):
+        some = [
+            mean for mean in means.values() if METHODS[mean.method].engine == engine and mean.timestep <= fit.longest
+        ]
+        own = extrapolate(some)
+        engines[engine] = [own.limit, own.limit_error]
+    points = []
+    for (method, step), mean in means.items():
+        costs = [result["cost_s_per_ns"] for result in found[quantity.ensemble, method, step]]
+        bias, error = (x / scale for x in fit.bias(mean))
+        spread = float(np.sqrt(variance * NS)) / scale
+        points.append(
+            Point(method, step, len(costs), mean.mean, mean.error, bias, error, float(np.median(costs)), spread)
+        )
+    ratios = {m: [squares[m] / freedom[m] / variance, float(np.sqrt(2 / freedom[m]))] for m in squares if freedom[m]}
+    return {"limit": [fit.limit, fit.limit_error], "longest_step_fs": fit.longest, "limits_of_engines": engines,
+            "variances_over_that_of_all": ratios, "points": points}  # fmt: skip
+
+
+def seconds(value: float) -> str:
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+def print_tables(result: dict) -> None:
+    for name, quantity in QUANTITIES.items():
+        one = result[name]
+        print(f"\n{quantity.title}: limit {one['limit'][0]:.5g} ± {one['limit'][1]:.2g} {quantity.unit}, steps up to "
+              f"{one['longest_step_fs']:g} fs")  # fmt: skip
+        for engine, (limit, error) in one["limits_of_engines"].items():
+            print(f"  {engine} alone: {limit:.5g} ± {error:.2g}")
+        for method, (ratio, error) in one["variances_over_that_of_all"].items():
+            print(f"  variance of {method} over that of all: {ratio:.2f} ± {error:.2f}")
+        goals = " | ".join(f"s to {target:g} (step)" for target in quantity.targets)
+        print(f"| method | bias at each step, {quantity.error_unit} | s/ns | {goals} |\n|---|---|---|---|---|")
+        for method in METHODS:
+            points = [point for point in one["points"] if point.method == method]
+            if points:
+                biases = ", ".join(f"{p.step:g} fs: {p.bias:+.4f} ± {p.bias_error:.4f}" for p in points)
+                costs = ", ".join(f"{p.cost:.0f}" for p in points)
+                cells = []
+                for target in quantity.targets:
+                    best = min(points, key=lambda p: p.seconds_to(target))
+                    time_needed = best.seconds_to(target)
+                    cells.append(
+                        f"{seconds(time_needed)} ({best.step:g} fs)" if time_needed < np.inf else "not reached"
+                    )
+                print(f"| {method} | {biases} | {costs} | {' | '.join(cells)} |")
+
+
+def draw(result: dict, path: Path) -> None:
+    """Total error against computing time: of each method, at each time, with its best step."""
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    for axis, (name, quantity) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
+        times = np.geomspace(1, 3e5, 200)
+        for method, look in METHODS.items():
+            points = [point for point in result[name]["points"] if point.method == method]
+            if points:
+                errors = np.array([point.total_error(times) for point in points])
+                best = errors.argmin(axis=0)
+                unknown = np.array([point.bias_error for point in points])[best]
+                error = errors.min(axis=0)
+                axis.plot(times, error, ":", color=look.color, lw=1.2)
+                axis.plot(times, np.where(error >= unknown, error, np.nan), color=look.color, lw=1.8, label=method)
+        for target in quantity.targets:
+            axis.axhline(target, color=FAINT, lw=0.8, zorder=0)
+        axis.set(xscale="log", yscale="log", xlim=(times[0], times[-1]), title=quantity.title,
+                 xlabel="computing time on one core, s", ylabel=f"total error, {quantity.error_unit}")  # fmt: skip
+        axis.title.set_color(INK)
+        axis.spines[["top", "right"]].set_visible(False)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of the runs; what is there is not run again")
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--next", type=int, metavar="N", help="do N runs; exit status 1 if none is left")
+    parser.add_argument("--collect", action="store_true", help="run nothing")
+    parser.add_argument("--json", type=Path, help="what was found, and the averages of all runs")
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    if not options.collect and not (options.folder / f"start{STARTS - 1}" / "sites.npz").exists():
+        make_starts(options.folder)
+    if options.next:
+        sys.exit(0 if any([do_next(options.folder, options.rounds) for _ in range(options.next)]) else 1)
+    while not options.collect and do_next(options.folder, options.rounds):
+        pass
+    found = read(options.folder)
+    result = {name: analyse(name, found) for name in QUANTITIES}
+    print_tables(result)
+    if options.json:
+        versions = [engine.version() for engine in (Rigidmd, Gromacs, OpenMM)]
+        tables = {name: one | {"points": [p._asdict() for p in one["points"]]} for name, one in result.items()}
+        every = [{"ensemble": e, "method": m, "step_fs": s, "runs": results} for (e, m, s), results in found.items()]
+        options.json.write_text(json.dumps({"versions": versions, **tables, "all": every}, indent=1) + "\n")
+    if options.figure:
+        draw(result, options.figure)
+
+
+if __name__ == "__main__":
+    main()
