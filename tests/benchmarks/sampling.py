@@ -88,12 +88,12 @@ METHODS = {
     "baoab + langevin": Method("rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False),
     "srkn_4 + velocity_rescaling": Method("rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}),
     "GROMACS md + v-rescale": Method(
-        "gromacs", "#c8553d", (1, 2, 4), (2, 4),
+        "gromacs", "#c8553d", (1, 2, 4, 8), (2, 4),
         {"integrator": "md", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.1, "ref-t": TEMPERATURE}),
     "GROMACS sd": Method(
         "gromacs", "#e2a08f", (2, 4), (),
         {"integrator": "sd", "tc-grps": "system", "tau-t": 1.0, "ref-t": TEMPERATURE}, False),
-    "OpenMM LangevinMiddle": Method("openmm", "#4f8a5b", (1, 2, 4), (4,), {}, False),
+    "OpenMM LangevinMiddle": Method("openmm", "#4f8a5b", (1, 2, 4, 8), (4,), {}, False),
 }  # fmt: skip
 
 
