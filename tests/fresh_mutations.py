@@ -82,7 +82,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F12", "bias of a mean against the step: its error forgets that the limit is made of the same mean",
-        "studies/accuracy/averages.py",
+        "studies/extrapolation.py",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)",
         "        return point.mean - self.limit, sqrt(max(0.0, others) + point.error**2)",
         ("test_accuracy.py::test_the_limit_at_a_step_of_zero_is_shared_and_long_steps_are_left_out",),

@@ -34,6 +34,11 @@ class Value(NamedTuple):
     correlation_ps: Bounded | None = None
     note: str = ""
 
+    @property
+    def header(self) -> str:
+        """Name and unit, for tables."""
+        return f"{self.name} ({self.unit})" if self.unit not in ("", "1") else self.name
+
     def __str__(self) -> str:
         if self.value is None:
             return f"{self.name}: {self.note}"

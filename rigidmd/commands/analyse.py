@@ -26,6 +26,9 @@ class _List(argparse.Action):
         help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)"),
     argument("--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
         help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)"),
+    argument("--extrapolate", metavar="KEY",
+        help="of a sweep: extrapolate all averages and values to a step of 0 over this time step, which the sweep "
+        "varies, such as stages.1.timestep_fs"),
     argument("--trust", action="append", default=[], metavar="FILE.py",
         help="run this Python file first, which may define analyses with @rigidmd.analysis; may be repeated"),
     argument("--list", action=_List, nargs=0, help="list the analyses"),
@@ -34,7 +37,9 @@ class _List(argparse.Action):
 def _analyse(options: Options) -> int:
     from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
-    from rigidmd.studies.sweep.folder import is_sweep
+    from rigidmd.commands.sweep import print_limits
+    from rigidmd.errors import OutputError
+    from rigidmd.studies.sweep.folder import is_sweep, read_manifest
     from rigidmd.studies.sweep.replicas import ANALYSES, analyse_sweep
 
     for path in options.trust:
@@ -50,7 +55,12 @@ def _analyse(options: Options) -> int:
                 _print_results(of.results, of.failed)
                 print()
             print(f"values of all in {folder / ANALYSES}")
+            if options.extrapolate is not None:
+                names = print_limits(folder, read_manifest(folder), options.extrapolate)
+                print(f"\n  files in {folder}: {', '.join(names)}")
             return 0
+        if options.extrapolate is not None:
+            raise OutputError(f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run")
         done = analyse_folder(folder, *request, progress)
     used = done.frames_used
     print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")

@@ -15,6 +15,7 @@ from rigidmd.errors import OutputError, visible
 
 if TYPE_CHECKING:
     from rigidmd.io.progress import Bar
+    from rigidmd.studies.sweep.folder import Manifest
     from rigidmd.studies.sweep.sweeping import OpenSweep
 
 
@@ -25,6 +26,7 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
     130, "run a scene at many points, a folder each, with a table and a figure of means and errors",
     "rigidmd sweep water.toml --set stages.equilibration.temperature_K=280,290,300 --set seed=1..8 --jobs 2\n"
     "  rigidmd sweep water.toml --replicas 8\n"
+    "  rigidmd sweep water.toml --set stages.2.timestep_fs=1,2,4 --extrapolate stages.2.timestep_fs --replicas 8\n"
     "  rigidmd sweep water.toml --set seed=1..64 --to slurm --walltime 4:00:00",
     argument("scene", metavar="SCENE", help="scene file (TOML)"),
     argument("--set", action="append", default=[], metavar="KEY=A,B,...", dest="sets",
@@ -41,6 +43,9 @@ COUNT = number(int, 1, 4096, "a number from 1 to 4096")
         help="run on a cluster of dask.distributed: tcp://HOST:8786, or `local` for one that is started here"),
     argument("--to", choices=["slurm"], help="run nothing, and write a script for an array of jobs, a point each"),
     argument("--collect", action="store_true", help="run nothing, and write table and figure of existing results"),
+    argument("--extrapolate", metavar="KEY",
+        help="extrapolate all averages to a step of 0, with their errors, over this time step of the last stage, which "
+        "--set varies; `rigidmd analyse` has the same option for what it measures"),
     argument("--point", type=number(int, 0, inf, "the number of a point, from 0 on"), metavar="K",
         help="run point K of an existing sweep, counted from 0"),
     TRUST, overrides=[], writes=True,
@@ -59,11 +64,12 @@ def _sweep(options: Options) -> int:
         if options.collect and not options.sets and options.replicas is None:
             if folder is None:
                 raise OutputError("--collect needs -o, the folder of the sweep, or the --set that it was made with")
-            return _collect(open_existing_sweep(folder, stack))
+            return _collect(open_existing_sweep(folder, stack), options.extrapolate)
         scene, axes = Path(options.scene), parse_axes(options.sets)
-        sweep = open_sweep(stack, scene, axes, folder, options.replicas, options.trust, options.force)
+        more = options.replicas, options.trust, options.force, options.extrapolate
+        sweep = open_sweep(stack, scene, axes, folder, *more)
         if options.collect or (options.to is not None and not sweep.left):
-            return _collect(sweep)
+            return _collect(sweep, options.extrapolate)
         if options.to is None:
             return _run(options, sweep)
         settings = options.walltime, options.threads or 1, options.trust, OUT_OF_TIME
@@ -85,6 +91,8 @@ def _check(options: Options) -> None:
         raise OutputError(f"--{alone[0]} and --{alone[1]} cannot be combined")
     if options.point is not None and (options.sets or options.replicas or options.force):
         raise OutputError("--point uses the settings in the folder; leave out --set, --replicas and --force")
+    if options.extrapolate is not None and (options.point is not None or options.to is not None):
+        raise OutputError("--extrapolate needs results; when all points have ended, use it with --collect")
     if options.collect and options.force:
         raise OutputError("--collect only reads existing results; leave out --force, which removes them")
 
@@ -110,7 +118,7 @@ def _run(options: Options, sweep: "OpenSweep") -> int:
         print(f"  {where}, {threads} thread{'s' if threads > 1 else ''} each", flush=True)
         with progress_of(sweep.left, "points", True) as bar:
             outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _shown_on(bar))
-    _print_results(sweep)
+    _print_results(sweep, options.extrapolate)
     print(
         f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {before} skipped, "
         f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
@@ -156,8 +164,8 @@ def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
     return receive
 
 
-def _print_results(sweep: "OpenSweep") -> None:
-    """Write and print the table of what has finished."""
+def _print_results(sweep: "OpenSweep", step: str | None) -> None:
+    """Write and print the table of what has finished. step : the key of --extrapolate"""
     from rigidmd.studies.sweep.table import collect, table_text
 
     table, files = collect(sweep.folder, sweep.manifest)
@@ -166,16 +174,29 @@ def _print_results(sweep: "OpenSweep") -> None:
     for name, why in table.failed.items():
         print(f"  {name} is not in the table: {why}")
     names = ["sweep.json", *(path.name for path in files)]
+    names += [] if step is None else print_limits(sweep.folder, sweep.manifest, step)
     count = len(sweep.manifest.points)
     print(f"\n  files in {sweep.folder}: {', '.join(names)}, and a folder for each of {count} points")
     if any(row.runs for row in table.rows):
         print(f"  `rigidmd analyse {shlex.quote(str(sweep.folder))}` measures all of them")
 
 
-def _collect(sweep: "OpenSweep") -> int:
+def print_limits(folder: Path, manifest: "Manifest", step: str) -> list[str]:
+    """Write and print what the averages of a sweep are at a step of 0; the names of the files."""
+    from rigidmd.studies.sweep.limits import extrapolate_sweep, write_limits
+
+    found = extrapolate_sweep(folder, manifest, step)
+    if found.limits:
+        print(f"\n{found.title}\n{found.as_text().text(range(len(found.columns()) + 1))}")
+    for line in found.missing:
+        print(f"  no limit: {line}")
+    return write_limits(folder, found, shlex.join(["rigidmd", *sys.argv[1:]]))
+
+
+def _collect(sweep: "OpenSweep", step: str | None) -> int:
     count = len(sweep.manifest.points)
     print(f"{sweep.manifest.name}: {count} points in {sweep.folder}, {count - sweep.left} of them finished")
-    _print_results(sweep)
+    _print_results(sweep, step)
     return FAILED if sweep.left else 0
 
 

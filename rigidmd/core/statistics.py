@@ -45,9 +45,14 @@ def standard_error(values: ArrayLike) -> np.ndarray:
 
 def error_of_mean(parts: ArrayLike) -> np.ndarray:
     """Standard error (...) of the mean of few independent values (n, ...), n > 1, see the theory chapter `errors`."""
+    return standard_error(parts) * student_factor(len(np.asarray(parts)) - 1)
+
+
+def student_factor(freedom: int) -> float:
+    """Half the range that holds 68 % of Student's distribution with these degrees of freedom."""
     from scipy import special  # slow to import
 
-    return standard_error(parts) * float(special.stdtrit(len(np.asarray(parts)) - 1, special.ndtr(1.0)))
+    return float(special.stdtrit(freedom, special.ndtr(1.0)))
 
 
 def format_with_error(value: float, error: float | None) -> str:

@@ -1,10 +1,6 @@
-"""`rigidmd accuracy --averages`: samples the last stage of a scene by several methods and steps, for their biases.
+"""`rigidmd accuracy --averages`: samples the last stage of a scene by several methods and steps, for their biases."""
 
-With a method of second order a mean is a + b dt² up to O(dt⁴). The limit a belongs to the ensemble, not to the
-integrator, so one weighted fit has the same a for all integrators and thermostats, and a b for each of them.
-"""
-
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import floor, inf, log10, nan, sqrt
 from typing import NamedTuple, cast
@@ -26,6 +22,7 @@ from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.couplings import THERMOSTATS
 from rigidmd.scene.stage import ERROR_TARGETS, Stage
 from rigidmd.scene.validation import did_you_mean
+from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, extrapolate
 from rigidmd.units import BAR, BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 BIAS_LIMIT = 0.01  # the step of this bias, as a fraction of the scale of a quantity, is reported
@@ -40,75 +37,6 @@ class AveragedQuantity(NamedTuple):
     bias_unit: str = ""  # of reported biases, `unit` when empty
     bias_size: float = 1.0  # of one such unit, in `unit`
     only: str = ""  # the integrator that has it, where not all do
-
-
-class MeanAtStep(NamedTuple):
-    method: str
-    timestep: float  # fs
-    mean: float
-    error: float
-
-
-class BiasFit(NamedTuple):
-    """mean = limit + slope[method] dt², over steps up to `longest`."""
-
-    limit: float
-    limit_error: float
-    slopes: dict[str, tuple[float, float]]  # method -> slope and its error, per fs²
-    weights: dict[MeanAtStep, float]  # of the points in the limit, which is their weighted sum
-    longest: float  # fs
-
-    def bias(self, point: MeanAtStep) -> tuple[float, float]:
-        """Mean less limit, and its error, which accounts for the weight of the mean in the limit."""
-        weight = self.weights.get(point, 0.0)
-        others = self.limit_error**2 - (weight * point.error) ** 2
-        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)
-
-
-def extrapolate(points: Sequence[MeanAtStep], exact: float | None = None) -> BiasFit:
-    """The limit of means at a step of zero, from all methods at once and from the short steps that dt² describes.
-
-    Long steps are left out one by one while chi² exceeds its mean by more than two of its standard deviations and
-    enough points are left. exact : the limit, where it is known. Raises ValueError without points.
-    """
-    steps = sorted({point.timestep for point in points}, reverse=True)
-    fits = [fit for longest in steps if (fit := _fit(points, longest, exact)) is not None]
-    for fit, chi2, freedom in fits:
-        if freedom == 0 or chi2 <= freedom + 2 * sqrt(2 * freedom):
-            return fit
-    if fits:
-        fit, chi2, freedom = fits[-1]
-        return fit._replace(limit_error=fit.limit_error * sqrt(chi2 / freedom))
-    best = min(points, key=lambda point: (point.timestep, point.error))
-    return BiasFit(best.mean, best.error, {}, {best: 1.0}, best.timestep)
-
-
-def _fit(points: Sequence[MeanAtStep], longest: float, exact: float | None) -> tuple[BiasFit, float, int] | None:
-    """Weighted least squares over steps up to the longest: fit, chi², degrees of freedom. None with too few points."""
-    points = [point for point in points if point.timestep <= longest]
-    methods = list(dict.fromkeys(point.method for point in points))
-    columns = [[float(point.method == name) * point.timestep**2 for point in points] for name in methods]
-    if exact is None:
-        columns.insert(0, [1.0] * len(points))
-    if len(points) < len(columns):
-        return None
-    error = np.array([point.error for point in points])
-    error = np.maximum(error, 1e-9 * error.max(initial=0.0) or 1.0)
-    design = np.array(columns).T / error[:, None]
-    value = np.array([point.mean for point in points]) - (exact or 0.0)
-    size = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv(design / size) / size[:, None]
-    found = inverse @ (value / error)
-    chi2, freedom = float(((value / error - design @ found) ** 2).sum()), len(points) - len(columns)
-    errors = np.linalg.norm(inverse, axis=1)
-    if exact is None:
-        limit, limit_error = float(found[0]), float(errors[0])
-        weights = dict(zip(points, (inverse[0] / error).tolist(), strict=True))
-        found, errors = found[1:], errors[1:]
-    else:
-        limit, limit_error, weights = exact, 0.0, {}
-    slopes = {name: (float(b), float(e)) for name, b, e in zip(methods, found, errors, strict=True)}
-    return BiasFit(limit, limit_error, slopes, weights, longest), chi2, freedom
 
 
 @dataclass

@@ -150,7 +150,7 @@ def _mean_curve(curves: list[Curve]) -> Curve | None:
 def _write_table(folder: Path, found: list[Combination]) -> None:
     """analysis.csv: a line for each combination, its values with their errors."""
     values = {
-        combination.title: {(result.name, v.name, v.unit): v for result in combination.results for v in result.values}
+        combination.title: {(result.name, v.header): v for result in combination.results for v in result.values}
         for combination in found
     }
     columns = [*key_columns(found[0].values), Column("runs", lambda combination: combination.runs)]
@@ -160,8 +160,6 @@ def _write_table(folder: Path, found: list[Combination]) -> None:
             value = values[combination.title].get(title)
             return value and [nine_digits(value.value), nine_digits(value.error)]
 
-        _, name, unit = title
-        header = f"{name} ({unit})" if unit not in ("", "1") else name
-        columns += with_error(header, measured, f"{header} error")
+        columns += with_error(title[1], measured, f"{title[1]} error")
     add_to_folder(folder, [ANALYSES])
     Table(columns, found).write(folder / ANALYSES, csv.QUOTE_NONNUMERIC)

@@ -26,6 +26,7 @@ from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, PointResult, PointTask, Pool, Send, run_task
 from rigidmd.studies.sweep.folder import FILES, SCRIPT, Manifest, SweepPoint, is_sweep, read_manifest, write_manifest
+from rigidmd.studies.sweep.limits import step_key
 from rigidmd.studies.sweep.plan import Axis, axes_of, merge_manifests, order_axes, read_points, update_state, with_seeds
 from rigidmd.studies.sweep.table import Table, collect
 
@@ -70,13 +71,14 @@ class OpenSweep(NamedTuple):
 
 def open_sweep(
     stack: ExitStack, scene: Path, axes: list[Axis], folder: Path | None = None, replicas: int | None = None,
-    trust: Sequence[str] = (), force: bool = False,
+    trust: Sequence[str] = (), force: bool = False, step: str | None = None,
 ) -> OpenSweep:  # fmt: skip
     """Check all points of a scene file, compare them with the folder, and write the manifest.
 
     folder : default: runs/NAME-sweep; no other sweep can run in it until the stack ends
     replicas : number of seeds, from the seed of the scene on
     trust : Python files that the scene may run; force : remove the sweep in the folder
+    step : a key that has to be a time step that varies
 
     Raises SceneError, OutputError.
     """
@@ -94,6 +96,8 @@ def open_sweep(
     if not is_empty(folder) and not is_sweep(folder):
         raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
     fresh, is_body = read_points(scene, axes if force else order_axes(folder, axes))
+    if step is not None:
+        step_key(fresh, step, Scene.read(scene, fresh.overrides(fresh.points[0])))
     lock = stack.enter_context(FolderLock(folder))
     manifest = merge_manifests(folder, fresh, force)
     with writing(folder, "made", "; name another folder with -o"):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
@@ -121,8 +122,8 @@ def key_columns(keys: Iterable[str]) -> list[Column]:
     return [Column(key, lambda row, key=key: cell(row.values[key])) for key in keys]
 
 
-def table_of(folder: Path, manifest: Manifest) -> Table:
-    """The table of the points that have finished."""
+def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> Table:
+    """The table of the points that have finished. with_analyses : also of the values of analyses in their folders"""
     rows, columns, failed = [], {}, {}
     for values, points in manifest.combinations():
         row = SweepRow(values)
@@ -131,6 +132,8 @@ def table_of(folder: Path, manifest: Manifest) -> Table:
                 continue
             try:
                 found = summarise_run(read_record(folder / point.folder))
+                if with_analyses:
+                    found |= _analysed(folder / point.folder)
             except RigidMDError as error:
                 failed[point.folder] = str(error)
                 continue
@@ -162,6 +165,12 @@ def summarise_run(record: Record) -> dict[str, Measured]:
     if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
         found[DRIFT] = drift, stages[-1].get("drift_error_kT_ns_per_degree_of_freedom")
     return found
+
+
+def _analysed(folder: Path) -> dict[str, Measured]:
+    """The values of analyses of a run, by name and unit."""
+    values = [value for entry in read_table(folder).values() for value in entry.values]
+    return {value.header: (value.value, value.error) for value in values if value.value is not None}
 
 
 def _summarise_motion(record: Record) -> dict[str, Measured]:

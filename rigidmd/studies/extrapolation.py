@@ -1,0 +1,119 @@
+"""Averages at a step of zero: mean = limit + slope dt^p, where p is the order of the integrator.
+
+The limit belongs to the ensemble, not to the integrator, so that one weighted fit has the same limit for all methods
+and a slope for each of them. See "Averages at a step of zero" in the theory chapter `errors`.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.core.statistics import format_signed, student_factor
+
+#: Degrees of freedom of the scatter of replicas, over all steps, from which on it gives the size of errors. With fewer
+#: the errors of single runs do.
+LEAST_FREEDOM = 8
+
+
+class MeanAtStep(NamedTuple):
+    method: str
+    timestep: float  # fs
+    mean: float
+    error: float
+
+
+class BiasFit(NamedTuple):
+    """mean = limit + slope[method] dt^order, over steps up to `longest`."""
+
+    limit: float
+    limit_error: float
+    slopes: dict[str, tuple[float, float]]  # method -> slope and its error, per fs^order
+    weights: dict[MeanAtStep, float]  # of the points in the limit, which is their weighted sum
+    longest: float  # fs
+    order: int = 2
+    chi2: float = 0.0
+    freedom: int = 0  # degrees of freedom of chi²: points less fitted numbers
+
+    def bias(self, point: MeanAtStep) -> tuple[float, float]:
+        """Mean less limit, and its error, which accounts for the weight of the mean in the limit."""
+        weight = self.weights.get(point, 0.0)
+        others = self.limit_error**2 - (weight * point.error) ** 2
+        return point.mean - self.limit, sqrt(max(0.0, others) + ((1 - weight) * point.error) ** 2)
+
+    def describe_limit(self) -> str:
+        return format_signed(self.limit, self.limit_error).lstrip("+")
+
+    def describe_chi2(self) -> str:
+        """Such as 3.2/4; empty if the fit has as many numbers as points."""
+        return f"{self.chi2:.2g}/{self.freedom}" if self.freedom else ""
+
+
+def extrapolate(points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2) -> BiasFit:
+    """The limit of means at a step of zero, from all methods at once and from the short steps that dt^order describes.
+
+    Long steps are left out one by one while chi² exceeds its mean by more than two of its standard deviations and
+    enough points are left. exact : the limit, where it is known. Raises ValueError without points.
+    """
+    steps = sorted({point.timestep for point in points}, reverse=True)
+    fits = [fit for longest in steps if (fit := _fit(points, longest, exact, order)) is not None]
+    for fit in fits:
+        if fit.freedom == 0 or fit.chi2 <= fit.freedom + 2 * sqrt(2 * fit.freedom):
+            return fit
+    if fits:
+        fit = fits[-1]
+        return fit._replace(limit_error=fit.limit_error * sqrt(fit.chi2 / fit.freedom))
+    best = min(points, key=lambda point: (point.timestep, point.error))
+    return BiasFit(best.mean, best.error, {}, {best: 1.0}, best.timestep, order)
+
+
+def _fit(points: Sequence[MeanAtStep], longest: float, exact: float | None, order: int) -> BiasFit | None:
+    """Weighted least squares over steps up to the longest. None with too few points."""
+    points = [point for point in points if point.timestep <= longest]
+    methods = list(dict.fromkeys(point.method for point in points))
+    columns = [[float(point.method == name) * point.timestep**order for point in points] for name in methods]
+    if exact is None:
+        columns.insert(0, [1.0] * len(points))
+    if len(points) < len(columns):
+        return None
+    error = np.array([point.error for point in points])
+    error = np.maximum(error, 1e-9 * error.max(initial=0.0) or 1.0)
+    design = np.array(columns).T / error[:, None]
+    value = np.array([point.mean for point in points]) - (exact or 0.0)
+    size = np.linalg.norm(design, axis=0)
+    inverse = np.linalg.pinv(design / size) / size[:, None]
+    found = inverse @ (value / error)
+    chi2, freedom = float(((value / error - design @ found) ** 2).sum()), len(points) - len(columns)
+    errors = np.linalg.norm(inverse, axis=1)
+    if exact is None:
+        limit, limit_error = float(found[0]), float(errors[0])
+        weights = dict(zip(points, (inverse[0] / error).tolist(), strict=True))
+        found, errors = found[1:], errors[1:]
+    else:
+        limit, limit_error, weights = exact, 0.0, {}
+    slopes = {name: (float(b), float(e)) for name, b, e in zip(methods, found, errors, strict=True)}
+    return BiasFit(limit, limit_error, slopes, weights, longest, order, chi2, freedom)
+
+
+def means_of_runs(runs: Mapping[float, Sequence[tuple[float, float | None]]]) -> list[MeanAtStep]:
+    """Means over the runs at each step, with errors; none where the runs are too few and too short for an error.
+
+    runs : step (fs) -> value and error of each of its runs
+    The errors of single runs give the ratios of the errors of the steps. Their common size is from the scatter of the
+    runs about the means of their steps if that has at least `LEAST_FREEDOM` degrees of freedom, else as it is.
+    """
+    steps = {step: np.array([value for value, _ in found]) for step, found in runs.items() if found}
+    within = [[e**2 for _, e in runs[step] if e is not None] for step in steps]  # variances of single runs
+    known = all(within) and all(np.mean(of_step) > 0 for of_step in within)
+    variances = [float(np.mean(of_step)) if known else 1.0 for of_step in within]
+    freedom, factor = sum(len(values) - 1 for values in steps.values()), 1.0
+    if freedom >= LEAST_FREEDOM:
+        squares = sum(len(x) * x.var() / v for x, v in zip(steps.values(), variances, strict=True))
+        factor = sqrt(float(squares) / freedom) * student_factor(freedom)
+    elif not known:
+        return []
+    return [
+        MeanAtStep("", step, float(values.mean()), factor * sqrt(variance / len(values)))
+        for (step, values), variance in zip(steps.items(), variances, strict=True)
+    ]
