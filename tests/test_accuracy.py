@@ -23,6 +23,7 @@ from support import (
     choosing,
     extrapolate,
     mean_and_error,
+    means_of_runs,
     measure,
     measure_accuracy,
     measure_averages,
@@ -539,6 +540,56 @@ def test_errors_of_a_limit_and_of_biases_are_those_of_repeated_measurements():
     assert np.mean([limit for limit, _ in limits]) == pytest.approx(2, abs=4 * limits[0][1] / np.sqrt(len(limits)))
 
 
+def test_a_fit_has_its_chi2_and_the_order_of_the_integrator():
+    points = [MeanAtStep("a", dt, 1 + 0.02 * dt**4, 0.1) for dt in (1.0, 2.0, 4.0)]
+    points[1] = points[1]._replace(mean=points[1].mean + 0.1)
+    fit = extrapolate(points, order=4)
+    assert fit.order == 4
+    assert fit.freedom == 1
+    assert 0 < fit.chi2 < 1
+    assert fit.limit == pytest.approx(1, abs=0.1)
+    assert fit.slopes["a"][0] == pytest.approx(0.02, rel=0.02)
+    assert extrapolate(points[:2]).freedom == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "runs", "more", "errors", "longest"),
+    [
+        ((2.0, 4.0), 1, 0.0, 1.0, 4.0),  # errors of single runs
+        ((1.0, 2.0, 4.0), 2, 0.0, 1.0, 4.0),
+        ((1.0, 2.0, 4.0), 4, 0.0, 0.6, 4.0),  # errors of single runs that are too small: the scatter counts
+        ((1.0, 2.0, 4.0), 8, 0.0, 1.6, 4.0),
+        ((2.0, 4.0), 8, 0.0, None, 4.0),  # runs that are too short for an error
+        ((1.0, 2.0, 3.0, 4.0, 6.0), 8, 6.0, 1.0, 4.0),  # the longest step has more than dt², and is left out
+    ],
+)
+def test_pulls_of_limits_have_unit_width(steps, runs, more, errors, longest):
+    """(limit - truth)/error of 1000 extrapolations, of which chi² leaves out a sound step of some by chance."""
+    rng, pulls, longests = np.random.default_rng(3), [], []
+    for _ in range(1000):
+        sampled = {}
+        for dt in steps:
+            values = 5 + 0.1 * dt**2 + more * (dt == steps[-1]) + rng.standard_normal(runs)
+            within = [None] * runs if errors is None else errors * np.exp(0.2 * rng.standard_normal(runs))
+            sampled[dt] = list(zip(values, within, strict=True))
+        fit = extrapolate(means_of_runs(sampled))
+        pulls.append((fit.limit - 5) / fit.limit_error)
+        longests.append(fit.longest)
+    assert np.mean(np.array(longests) == longest) > 0.85
+    assert max(longests) == longest
+    assert abs(np.mean(pulls)) < 0.15
+    assert 0.9 < np.std(pulls) < 1.2
+    assert 0.9 < np.quantile(np.abs(pulls), 0.683) < 1.2
+
+
+def test_means_of_few_runs_without_errors_are_left_out():
+    values = [(1.0, None), (1.2, None)]
+    assert means_of_runs({1.0: values, 2.0: values}) == []
+    known = means_of_runs({1.0: [(1.0, 0.3), (1.2, 0.4)], 2.0: [(1.5, 0.3)]})
+    assert known[0][1:] == pytest.approx((1.0, 1.1, np.sqrt((0.09 + 0.16) / 2 / 2)))
+    assert known[1][1:] == (2.0, 1.5, 0.3)
+
+
 @pytest.fixture(scope="module")
 def oscillators():
     """Springs at w dt = 1 and less, by velocity Verlet and BAOAB."""
@@ -577,7 +628,8 @@ def test_averages_of_oscillators_are_off_by_what_theory_says(oscillators):
 @pytest.mark.soak
 def test_what_is_said_of_averages_follows_from_them(oscillators):
     quantities = {quantity.name: quantity for quantity in oscillators.quantities}
-    assert set(quantities) == {"U", "T_trans", "T_trans unbiased", "pressure"}
+    assert {quantity.name for quantity in oscillators.main} == {"U", "T_trans", "T_trans unbiased", "pressure"}
+    assert "Kinetic Energy (kJ/mole)" in quantities
     potential = quantities["U"]
     limit = oscillators.fit(potential)
     assert abs(limit.limit - 1.5 * 0.0083144626 * 300) < 4 * limit.limit_error
@@ -630,6 +682,8 @@ def test_averages_are_written_and_what_fails_is_said(tmp_path, capsys, monkeypat
     assert told["runs"][0]["averages"]["density"]["mean"] == float(rows[0]["density (g/cm³)"])
     assert told["runs"][2]["failure"].startswith("stopped at step")
     assert "pressure" not in told["quantities"]
+    assert told["quantities"]["density"]["degrees_of_freedom"] == 0  # one method at two steps
+    assert told["runs"][0]["averages"]["Temperature (K)"]["mean"] > 0
     assert (folder / "averages.png").read_bytes().startswith(b"\x89PNG")
     page = (folder / "averages.html").read_text("utf-8")
     assert page.count("<tr>") == 2 + 1 + 3  # heads, a method, runs

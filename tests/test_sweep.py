@@ -45,6 +45,7 @@ from support import axis_settings as settings
 import rigidmd
 from rigidmd.commands import cli
 from rigidmd.errors import OutputError, SceneError
+from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
 ARGON = """
@@ -250,7 +251,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
     for changes, expected in (
         ([*GRID, "--set", "forces.cutoff_A=7.5"], "forces.cutoff_A is 7.5, there 8.0"),
         (GRID[:2], "it varies start.temperature_K and seed, not start.temperature_K"),
-        ([*GRID, "--set", "stages.0.duration_ps=1"], "stages.0.duration_ps is 1.0, there 0.5"),
+        ([*GRID, "--set", "stages.0.duration_ps=2"], "stages.0.duration_ps is 1.0, there 0.5"),
     ):
         assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
         said = capsys.readouterr().err
@@ -284,6 +285,54 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
         "notes.txt", "sweep.json",
     }  # fmt: skip
     assert states(copied) == {"seed=1": "waiting", "seed=2": "waiting"}
+
+
+STEP = "stages.0.timestep_fs"
+
+
+def test_averages_at_a_step_of_zero(argon, tmp_path, capsys):
+    folder = tmp_path / "steps"
+    swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
+    fixed = ["--set", "stages.0.duration_ps=2", "--set", "output.log_interval_ps=0.02", "-o", str(folder)]
+    with ExitStack() as stack:
+        axes = [parse_axis(text) for text in (*swept[1::2][:2], fixed[1], fixed[3])]
+        there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
+        for point in there.manifest.points:
+            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+    assert cli.main(["analyse", str(folder), "--only", "rdf"]) == 0
+    assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
+    said = capsys.readouterr().out
+    assert "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs" in said
+    assert "sweep.png, extrapolation.csv, extrapolation.png, extrapolation.html" in said
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        rows = {(row["start.temperature_K"], row["average"]): row for row in csv.DictReader(file)}
+    means = {(row["start.temperature_K"], row[STEP]): float(row["Temperature (K)"]) for row in table(folder)}
+    for temperature in ("90", "120"):
+        assert any(at == temperature and "first peak (Å)" in name for at, name in rows)
+        row = rows[temperature, "Temperature (K)"]
+        assert (row["order"], row["degrees of freedom"]) == ("2", "1")
+        bias = float(row["bias at 5 fs"])
+        assert float(row["limit"]) + bias == pytest.approx(means[temperature, "5"], rel=1e-6)
+        assert float(row["limit error"]) > 0
+    assert "<svg" in (folder / "extrapolation.html").read_text("utf-8")
+    assert (folder / "extrapolation.png").stat().st_size > 10_000
+
+
+def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
+    (scene := tmp_path / "argon.toml").write_text(ARGON + "[[stages]]\nduration_ps = 1\n")
+    steps = ["--set", "stages.0.timestep_fs=2,4"]
+    for arguments, expected in (
+        ([*steps, "--extrapolate", "stages.nve.timestep_fs"], "is not varied; this sweep varies stages.0.timestep_fs"),
+        (["--set", "seed=1,2", "--extrapolate", "seed"], "seed is not the time step of a stage of molecules"),
+        ([*steps, "--extrapolate", "stages.0.timestep_fs", "--to", "slurm", "--walltime", "1:00:00"], "needs results"),
+        ([*steps, "--extrapolate", "stages.0.timestep_fs"], "is not the step of the stage whose averages are taken"),
+    ):
+        assert cli.main(["sweep", str(scene), *arguments, "-o", str(tmp_path / "none")]) == 2
+        assert expected in capsys.readouterr().err
+        assert not (tmp_path / "none").exists()
+    point = finished / "temperature_K=90_seed=1"
+    assert cli.main(["analyse", str(point), "--extrapolate", "stages.0.timestep_fs", "--only", "rdf"]) == 2
+    assert "needs a sweep over a time step" in capsys.readouterr().err
 
 
 def test_replicas_of_unlike_axes_and_short_runs():

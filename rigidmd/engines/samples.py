@@ -70,6 +70,12 @@ _HINTS = get_type_hints(Sample, include_extras=True)
 COLUMNS: dict[str, Column] = {name: get_args(_HINTS[name])[1] for name in Sample._fields if name != "user_energies"}
 
 
+#: Columns whose means have no meaning.
+NOT_AVERAGED = {
+    "step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved",
+}  # fmt: skip
+
+
 def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
     return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
 

@@ -12,7 +12,7 @@ from rigidmd.core.integrators import WITH_THERMOSTAT
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.model import remove_momentum
-from rigidmd.engines.samples import Samples
+from rigidmd.engines.samples import COLUMNS, NOT_AVERAGED, Samples
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.run.mean_box import scale_to_mean_box
@@ -37,6 +37,7 @@ class AveragedQuantity(NamedTuple):
     bias_unit: str = ""  # of reported biases, `unit` when empty
     bias_size: float = 1.0  # of one such unit, in `unit`
     only: str = ""  # the integrator that has it, where not all do
+    is_main: bool = True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
 
 
 @dataclass
@@ -70,6 +71,10 @@ class Averages:
 
     def __post_init__(self):
         self._fits: dict[str, BiasFit] = {}
+
+    @property
+    def main(self) -> list[AveragedQuantity]:
+        return [quantity for quantity in self.quantities if quantity.is_main]
 
     def points(self, quantity: AveragedQuantity) -> list[MeanAtStep]:
         return [point for run in self.runs if (point := self.point(run, quantity))]
@@ -199,6 +204,9 @@ def measure_averages(
     elif state.volume < np.inf:
         quantities.append(AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR))
     runs = [run for _, run in plan]
+    for column in COLUMNS.values():  # where it varies
+        if any(run.averages.get(column.header, (0.0, 0.0))[1] > 0 for run in runs):
+            quantities.append(AveragedQuantity(column.header, column.unit, nan, is_main=False))
     return Averages(scene.name, stage.label, stage.temperatures[0], count, freedom.total, sample, quantities, runs)
 
 
@@ -277,6 +285,7 @@ def _sample(scene: MolecularScene, stage: Stage, state: State, run: AverageRun, 
         "T_rot unbiased": results["temperature_rotation_unbiased"],
         "pressure": results["pressure_bar"], "density": results["density"],
     }  # fmt: skip
+    series |= {column.header: results[name] for name, column in COLUMNS.items() if name not in NOT_AVERAGED}
     for name, values in series.items():
         average, error = mean_and_error(values[late])
         if average is not None and error is not None:

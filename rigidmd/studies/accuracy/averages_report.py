@@ -44,7 +44,7 @@ def brief_table(found: Averages) -> Table:
         Column("forces/ps", lambda run: f"{run.forces_per_ps:.4g}"),
         Column("s/ns", lambda run: "fails" if run.failure else run.seconds_per_ns),
         *(Column(f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})",
-                 lambda run, q=q: (bias := found.bias(run, q)) and format_signed(*bias)) for q in found.quantities),
+                 lambda run, q=q: (bias := found.bias(run, q)) and format_signed(*bias)) for q in found.main),
     ], found.runs)  # fmt: skip
 
 
@@ -60,13 +60,13 @@ def bias_conclusions(found: Averages) -> list[str]:
 
 def describe_references(found: Averages) -> list[str]:
     lines = []
-    for quantity in found.quantities:
+    for quantity in found.main:
         fit = found.fit(quantity)
         if fit is None or quantity.exact is not None:
             continue
-        limit = format_signed(fit.limit, fit.limit_error).lstrip("+")
         how = f"all methods at steps to {fit.longest:g} fs" if fit.slopes else "the shortest step alone"
-        lines.append(f"{quantity.name} at a step of zero: {limit} {quantity.unit}, from {how}")
+        how += f" (chi² {fit.chi2:.2g} for {fit.freedom} degrees of freedom)" if fit.freedom else ""
+        lines.append(f"{quantity.name} at a step of zero: {fit.describe_limit()} {quantity.unit}, from {how}")
     if any(quantity.exact is not None for quantity in found.quantities):
         lines.append(f"temperatures are compared with {found.temperature:g} K")
     return lines
@@ -78,7 +78,7 @@ def methods_of(found: Averages) -> list[str]:
 
 def _describe_limits(found: Averages) -> list[str]:
     lines = []
-    for quantity in found.quantities:
+    for quantity in found.main:
         steps = [
             f"{method} {'' if at[1] else 'none seen, more than '}{at[0]:.2g} fs"
             for method in methods_of(found)
@@ -91,7 +91,7 @@ def _describe_limits(found: Averages) -> list[str]:
 
 def describe_failures(found: Averages) -> list[str]:
     """Sentences: which runs failed or were too short."""
-    names = {quantity.name for quantity in found.quantities}
+    names = {quantity.name for quantity in found.main}
     failed = [(run, run.failure) for run in found.runs if run.failure]
     why = f"{found.sampled:g} ps are too short for an error; sample longer (--sample-ps)"
     short = [(run, [name for name in run.short if name in names]) for run in found.runs]
@@ -116,6 +116,7 @@ def to_json(found: Averages, command: str) -> dict:
             steps = {method: at for method in methods if (at := found.step_at_limit(method, quantity))}
             quantities[quantity.name] |= {
                 "bias_unit": _bias_unit(quantity), "reference": fit.limit, "reference_error": fit.limit_error,
+                "chi2": fit.chi2, "degrees_of_freedom": fit.freedom,
                 "longest_step_in_fit_fs": fit.longest, "bias_limit": found.bias_limit(quantity),
                 "step_of_that_bias_fs": {name: {"step": step, "seen": seen} for name, (step, seen) in steps.items()},
             }  # fmt: skip
@@ -141,7 +142,7 @@ def _run_to_json(found: Averages, run: AverageRun) -> dict:
 
 def averages_figure(found: Averages):
     """Bias against the step, a panel for each quantity, with error bars and the band within 1 %."""
-    shown = [quantity for quantity in found.quantities if found.points(quantity)]
+    shown = [quantity for quantity in found.main if found.points(quantity)]
     columns = min(3, max(1, len(shown)))
     rows = max(1, -(-len(shown) // columns))
     figure = new_figure(3.7 * columns, 3.0 * rows + 0.9)
@@ -179,7 +180,7 @@ def averages_page(found: Averages, command: str) -> str:
         at = found.step_at_limit(method, quantity)
         return "" if at is None else f"{'' if at[1] else '> '}{at[0]:.2g}"
 
-    judged = [q for q in found.quantities if any(found.step_at_limit(method, q) for method in methods)]
+    judged = [q for q in found.main if any(found.step_at_limit(method, q) for method in methods)]
     rows = [[colored[method], *(step(method, q) for q in judged)] for method in methods]
     scales = dict.fromkeys(describe_scale(q) for q in judged)
     of = [f"{scale} ({', '.join(q.name for q in judged if describe_scale(q) == scale)})" for scale in scales]

@@ -52,8 +52,8 @@ class Limits(NamedTuple):
 
     @property
     def title(self) -> str:
-        laws = dict.fromkeys(f"dt{_power(limit.fit.order)} ({limit.method})" for limit in self.limits)
-        return f"averages at a step of 0, from errors of order {', '.join(laws)} in {self.key}"
+        powers = dict.fromkeys(f"dt{_power(limit.fit.order)} ({limit.method})" for limit in self.limits)
+        return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
 
     def columns(self) -> list[Column]:
         """The values of the other keys."""

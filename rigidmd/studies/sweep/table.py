@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
-from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS
+from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
 from rigidmd.io.write import Column, nine_digits, with_error
@@ -23,10 +23,6 @@ from rigidmd.studies.sweep.folder import FIGURE, SEED, TABLE, Manifest, describe
 if TYPE_CHECKING:
     import pandas
 
-#: Columns of the log whose means have no meaning.
-LEFT_OUT = {
-    "step", "time", "stage_name", "stage", "drift", "momentum", "orthogonality_error", "heat", "work", "conserved",
-}  # fmt: skip
 POTENTIAL, DRIFT = "Potential Energy per molecule (kJ/mole)", "Drift (kT/ns per degree of freedom)"
 #: Columns of the printed table and the figure: for molecules, for a body.
 MAIN = ("Temperature (K)", POTENTIAL, "Pressure (bar)", "Density (g/mL)", DRIFT)
@@ -150,7 +146,7 @@ def summarise_run(record: Record) -> dict[str, Measured]:
     _, production = production_samples(record)
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
-        if name in LEFT_OUT:
+        if name in NOT_AVERAGED:
             continue
         average, error = mean_and_error(values[production])
         if average is None:
