@@ -394,7 +394,7 @@ HOMES = {
     "run.molecular": "MolecularRecord MolecularRun",
     "run.signals": "interruptible",
     "studies.accuracy.averages": ("AverageRun AveragedQuantity Averages measure_averages start_of_last_stage "),
-    "studies.extrapolation": "LEAST_FREEDOM MeanAtStep extrapolate means_of_runs",
+    "studies.extrapolation": "MeanAtStep extrapolate means_of_runs",
     "studies.compare": "compare describe_run_comparison",
     "studies.accuracy.accuracy": "measure_accuracy trial_table write_accuracy",
     "studies.stability.report": "run_cases selected_cases",
