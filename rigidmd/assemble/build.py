@@ -200,7 +200,9 @@ def integrator_of_stage(system: System, k: int) -> Scheme:
     elif thermostat is None and not stage.has_barostat and couplings.DEFAULT_THERMOSTAT in kinds:
         # An idle thermostat, so that all stages run the same machine code.
         thermostat = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
-    if thermostat is not None:
+    if stage.is_hybrid and system.thermostat is None:
+        found = found.with_trajectories(thermostat_of(system, k), stage.steps_together)
+    elif thermostat is not None:
         found = found.with_thermostat(thermostat, halved=getattr(thermostat, "halved", True))
     if stage.has_barostat:
         barostat = barostat_of(system, k)

@@ -6,8 +6,8 @@ from math import inf, log2
 from typing import Any, Literal, NamedTuple
 
 #: Kinds of flows: forces; free flight and rotation; thermostat; removal of the total momentum; barostat; change of the
-#: volume by the inertia of a piston.
-KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT, SCALE_BOX = 0, 1, 2, 3, 4, 5
+#: volume by the inertia of a piston; start and test of a trajectory of hybrid Monte Carlo.
+KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT, SCALE_BOX, BEGIN_TRAJECTORY, END_TRAJECTORY = range(8)
 #: Error of sums and mirrored fractions of a row, from printed coefficients.
 ROUNDING = 1e-10
 
@@ -15,10 +15,11 @@ ROUNDING = 1e-10
 class Flow(NamedTuple):
     """One flow of a step."""
 
-    kind: int  # KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT or SCALE_BOX
+    kind: int  # KICK, DRIFT, ...
     fraction: float  # of the time step; of `every` time steps for a flow that acts every `every` steps
     gradient: float = 0.0  # of a kick: tau/dt² of its gradient (dynamics.force_gradient)
-    every: int = 1  # it acts at every n-th step of a segment
+    every: int = 1  # it acts in one of `every` steps of a segment,
+    phase: int = 1  # 1: in the last one of them, 0: in the first one
 
     def describe(self) -> str:
         """Description of a kick or drift for messages."""
@@ -79,6 +80,12 @@ class Scheme(_SchemeFields):
             return self._replace(flows=flows, thermostat=thermostat)
         return self._replace(flows=(*self.flows, Flow(THERMOSTAT, 1.0)), thermostat=thermostat)
 
+    def with_trajectories(self, thermostat: tuple, steps: int) -> "Scheme":
+        """This scheme in trajectories of `steps` steps that are accepted or rejected; new momenta before each."""
+        begins = Flow(THERMOSTAT, 1.0, every=steps, phase=0), Flow(BEGIN_TRAJECTORY, 0.0, every=steps, phase=0)
+        flows = (*begins, *self.flows, Flow(END_TRAJECTORY, 0.0, every=steps))
+        return self._replace(flows=flows, thermostat=thermostat)
+
     def with_barostat(self, barostat: tuple, every: int) -> "Scheme":
         """This scheme with a barostat that acts at the end of every `every` steps."""
         return self._replace(flows=(*self.flows, Flow(BAROSTAT, float(every), every=every)), barostat=barostat)
@@ -95,6 +102,11 @@ class Scheme(_SchemeFields):
     def with_momentum_removal(self, every: int) -> "Scheme":
         """This scheme with the total momentum of all molecules removed at the end of every `every` steps."""
         return self._replace(flows=(*self.flows, Flow(REMOVE_MOMENTUM, 0.0, every=every)))
+
+    @property
+    def trajectory_steps(self) -> int:
+        """Steps that are accepted or rejected together; 0 without hybrid Monte Carlo."""
+        return max(flow.every if flow.kind == END_TRAJECTORY else 0 for flow in self.flows)
 
     @property
     def kicks(self) -> tuple[float, ...]:

@@ -8,10 +8,13 @@ import numpy as np
 from rigidmd.compile import (
     BoundTask, Code, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments, pack_arguments, task,
 )  # fmt: skip
-from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, SCALE_BOX, THERMOSTAT, Scheme
+from rigidmd.core.integrators import (
+    BAROSTAT, BEGIN_TRAJECTORY, DRIFT, END_TRAJECTORY, KICK, SCALE_BOX, THERMOSTAT, Scheme,
+)  # fmt: skip
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
 from rigidmd.dynamics.barostats import apply_barostat, compute_step_load, scale_box
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
+from rigidmd.dynamics.hybrid_monte_carlo import know_potential, start_or_test_trajectory
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
 from rigidmd.dynamics.thermostats import apply_thermostat, thermostat_code
@@ -41,12 +44,14 @@ def molecule_code(model: NamedTuple, thermostat: tuple) -> Code | None:
 class FlowArrays(NamedTuple):
     """The flows of a scheme as arrays, in their order."""
 
-    kind: np.ndarray  # (flows,) KICK, DRIFT, THERMOSTAT, REMOVE_MOMENTUM, BAROSTAT or SCALE_BOX
+    kind: np.ndarray  # (flows,) KICK, DRIFT, ..., see core.integrators
     fraction: np.ndarray  # (flows,) of the time step
     moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
-    every: np.ndarray  # (flows,) the interval in steps at which the flow acts
+    every: np.ndarray  # (flows,) the interval in steps at which the flow acts,
+    phase: np.ndarray  # (flows,) at its begin, 0, or at its end, 1
     gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
     last: int  # index of the last drift
+    trajectory: int  # steps of a trajectory of hybrid Monte Carlo, or 0
 
 
 def flow_arrays(scheme: Scheme) -> FlowArrays:
@@ -56,14 +61,14 @@ def flow_arrays(scheme: Scheme) -> FlowArrays:
     last = int(np.flatnonzero(kind == DRIFT)[-1])
     moment[last:] = 1.0
     gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
-    every = np.array([flow.every for flow in scheme.flows])
-    return FlowArrays(kind, fraction, moment, every, gradient, last)
+    every, phase = (np.array([getattr(flow, name) for flow in scheme.flows]) for name in ("every", "phase"))
+    return FlowArrays(kind, fraction, moment, every, phase, gradient, last, scheme.trajectory_steps)
 
 
 @kernel
 def advance(
     model, code, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
-    barostat_workspace, dt, until, observed, progress
+    barostat_workspace, trajectory_workspace, dt, until, observed, progress
 ):  # fmt: skip
     """Take steps of dt until state.step is `until`. Returns a status code.
 
@@ -87,7 +92,8 @@ def advance(
             if flows.kind[k] == KICK:
                 if gradient_workspace is None:
                     if progress[1] == 0:
-                        last = observed and state.step[NOW] + 1 == until and k > flows.last
+                        now = state.step[NOW] + 1
+                        last = k > flows.last and (observed and now == until or is_tested(flows, now - state.step[ORIGIN]))
                         which = WITH_ENERGIES if last else FORCES_ONLY
                         status = compute_step_load(barostat, terms, state, load, barostat_workspace, flows, which)
                         if status != OK:
@@ -109,13 +115,21 @@ def advance(
                 pending = NO_PENDING_KICKS
                 state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
                 progress[1] = 0
-            elif (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
+            elif (state.step[NOW] - state.step[ORIGIN] + flows.phase[k]) % flows.every[k] == 0:
                 pending = apply_pending_kicks(model, code, state, load, pending)
                 if flows.kind[k] == THERMOSTAT:
                     apply_thermostat(thermostat, model, code, state, thermostat_workspace, h, DRAWS * k)
                 elif flows.kind[k] == BAROSTAT:
                     status = apply_barostat(
                         barostat, model, terms, state, load, barostat_workspace, progress, h, DRAWS * k
+                    )
+                    if status != OK:
+                        return status
+                    know_potential(thermostat, trajectory_workspace, barostat_workspace)
+                elif flows.kind[k] == BEGIN_TRAJECTORY or flows.kind[k] == END_TRAJECTORY:
+                    status = start_or_test_trajectory(
+                        thermostat, model, code, terms, state, load, thermostat_workspace, trajectory_workspace,
+                        progress, flows.kind[k] == BEGIN_TRAJECTORY, DRAWS * k
                     )
                     if status != OK:
                         return status
@@ -129,6 +143,12 @@ def advance(
         state.step[NOW] += 1
     apply_pending_kicks(model, code, state, load, pending)
     return OK
+
+
+@kernel(inline=True)
+def is_tested(flows, step):
+    """Whether a trajectory of hybrid Monte Carlo ends with a step of the segment, counted from 1."""
+    return flows.trajectory > 0 and step % flows.trajectory == 0
 
 
 #: Indices of `Advance._integers`: `until` and `observed` of `advance`, its status, and the three numbers of `progress`.

@@ -65,6 +65,16 @@ class Langevin(NamedTuple):
     key: Key
 
 
+class HybridMonteCarlo(NamedTuple):
+    """New momenta, in whole or in part, before each trajectory of `dynamics.hybrid_monte_carlo`: the flow of Langevin's
+    thermostat over one step, whose frictions are infinite for wholly new momenta."""
+
+    thermal_energy: Ramp  # kB T, u Å²/ps²
+    friction_translation: float  # 1/ps
+    friction_rotation: float  # 1/ps
+    key: Key
+
+
 class Andersen(NamedTuple):
     """Random collisions, on average after `time_constant`, that redraw the momenta of one molecule (Andersen 1980)."""
 
@@ -101,6 +111,9 @@ THERMOSTATS = {
         thermal, stage.thermostat_time, stage.nose_hoover_links, freedom.translation, freedom.rotation
     ),
     "andersen": lambda stage, thermal, freedom, key: Andersen(thermal, stage.thermostat_time, key),
+    "hybrid_monte_carlo": lambda stage, thermal, freedom, key: HybridMonteCarlo(
+        thermal, *(stage.refreshment_rate,) * 2, key
+    ),
 }
 
 
@@ -112,13 +125,15 @@ def thermostat_workspace() -> np.ndarray:
 def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
     """The tasks of a thermostat that act on blocks of molecules, see `compile.Code`; empty if it has none."""
     state, workspace = EXAMPLE[0], thermostat_workspace()
-    if isinstance(thermostat, Langevin | Andersen):
-        apply = _apply_langevin if isinstance(thermostat, Langevin) else _apply_andersen
-        return {"molecules": (apply, (thermostat, model, state, workspace, 0.0, 0))}
+    found: dict[str, tuple] = {}
+    if isinstance(thermostat, Langevin | Andersen | HybridMonteCarlo):
+        apply = _apply_andersen if isinstance(thermostat, Andersen) else _apply_langevin
+        found["molecules"] = apply, (thermostat, model, state, workspace, 0.0, 0)
+    if isinstance(thermostat, VelocityRescaling | NoseHoover | HybridMonteCarlo):
+        found["kinetic_energies"] = _compute_kinetic_energies, (model, state, workspace)
     if isinstance(thermostat, VelocityRescaling | NoseHoover):
-        energies = (_compute_kinetic_energies, (model, state, workspace))
-        return {"kinetic_energies": energies, "scale": (_scale, (state, 0.0, 0.0))}
-    return {}
+        found["scale"] = _scale, (state, 0.0, 0.0)
+    return found
 
 
 @chosen_by_type
@@ -148,7 +163,7 @@ def _apply_rescaling(thermostat, model, code, state, workspace, h, draw):
     scale_momenta(code, state, sqrt(scale2), sqrt(scale2))
 
 
-@implements(apply_thermostat, (Langevin, Andersen))
+@implements(apply_thermostat, (Langevin, Andersen, HybridMonteCarlo))
 def _apply_by_molecule(thermostat, model, code, state, workspace, h, draw):
     blocks = blocks_of(len(state.velocity))
     call_blocks(code, "molecules", pack_arguments((thermostat, model, state, workspace, h, draw)), blocks)

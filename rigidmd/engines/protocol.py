@@ -81,6 +81,10 @@ class Engine(Protocol):
         """Moves of the box, tried and accepted so far."""
 
     @property
+    def trajectories(self) -> np.ndarray | None:
+        """Sums (5,) over the trajectories of hybrid Monte Carlo so far, see `dynamics.hybrid_monte_carlo`."""
+
+    @property
     def chosen_steps(self) -> tuple[int, int] | None:
         """Steps that a solver has chosen itself, and its evaluations of forces."""
 

@@ -282,9 +282,10 @@ class RunLoop:
             shown, pace = None, inf
             self._bar.unpause()
             while done < segment.steps and not self.interrupted:
-                to = int(min(schedule.next_observation(done), self._until - position.first))
-                if pace > 0:
-                    to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))  # the first step alone, as it may be slow
+                to, together = min(schedule.next_observation(done), self._until - position.first), segment.together
+                if pace > 0:  # the first step alone, as it may be slow
+                    to = min(to, done + max(1, int(SEGMENT_SECONDS / pace)))
+                to = done + -int((done - to) // together) * together
                 before, shown = shown, schedule.due(to)
                 with_energies = any(each.reads_energies for each, now in zip(observers, shown, strict=True) if now)
                 began = clock.perf_counter()

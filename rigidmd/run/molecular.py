@@ -227,7 +227,7 @@ class MolecularRun(RunPart):
         stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
         if stage.is_minimisation:
             return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
-        return Segment(self._integrator(k), step, stage.steps)
+        return Segment(self._integrator(k), step, stage.steps, together=stage.steps_together)
 
     def durations(self) -> list[float]:
         return [stage.duration for stage in self.scene.stages]
@@ -328,7 +328,7 @@ class MolecularRun(RunPart):
     def observe(self, moment: Moment) -> Observation:
         """The observation at a moment. The drift of its stage is counted from the last sample before the stage."""
         stage = self.scene.stages[moment.stage]
-        is_verlet = stage.integrator == "velocity_verlet" and not stage.is_minimisation
+        is_verlet = stage.integrator == "velocity_verlet" and not (stage.is_minimisation or stage.is_hybrid)
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
         return observe(

@@ -21,6 +21,7 @@ class Segment(NamedTuple):
     dt: float  # ps, or s for a single body
     steps: int
     steps_before: int = 0  # in the same count of the intervals of observers
+    together: int = 1  # steps between which nothing is observed
     action: Callable[[bool | None], None] | None = None  # called before the steps, with whether to show progress
 
 
@@ -28,14 +29,15 @@ class ObservationSchedule:
     """When observers are called in a segment, in which steps are counted."""
 
     def __init__(self, observers: Collection[Observer], segment: Segment):
-        self._observers, self._last = observers, segment.steps
+        self._observers, self._last, together = observers, segment.steps, segment.together
         self._regular: list[tuple[int, int]] = []  # steps between two calls of each, or 0; steps before the segment
         for observer in observers:
             if observer.interval is None:
-                self._regular.append((observer.steps or 0, 0))
+                self._regular.append((-(-(observer.steps or 0) // together) * together, 0))
             else:  # may continue from the segment before
                 interval = above_zero(observer.interval, f"the interval of {type(observer).__name__}")
-                self._regular.append((max(1, round(interval / segment.dt)), segment.steps_before))
+                every = max(1, round(interval / (segment.dt * together))) * together
+                self._regular.append((every, segment.steps_before))
 
     def next_observation(self, done: int) -> int:
         """Number of steps at which the next observer is called, after `done` steps."""

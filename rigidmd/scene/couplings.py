@@ -50,6 +50,16 @@ def _describe_frictions(values: Values) -> str:
     return f"friction {translation:g}/ps" + (f" ({rotation:g}/ps of rotation)" if rotation != translation else "")
 
 
+#: Length of a trajectory of hybrid Monte Carlo, ps.
+TRAJECTORY_PS = 0.1
+
+
+def _describe_trajectories(values: Values) -> str:
+    steps, new = values.values()
+    drawn = "" if new == 1 else f", {new:g} of each momentum's variance drawn anew"
+    return f"trajectories of {steps:g} step{'s' if steps > 1 else ''}{drawn}"
+
+
 def _interval(stage: Any) -> float:
     return (stage.barostat_time_ps or BAROSTAT_TIME) / MOVES_PER_TIME
 
@@ -73,6 +83,13 @@ THERMOSTATS = {
     ),
     "andersen": Coupling(
         "collisions", "Andersen 1980, J. Chem. Phys. 72, 2384", {"thermostat_time_ps": 1.0}, on_molecules=True,
+    ),
+    "hybrid_monte_carlo": Coupling(
+        "trajectories from new momenta, accepted or rejected: averages without an error of the step",
+        "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
+        {"trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)),
+         "momentum_refreshment": 1.0},
+        on_molecules=True, time=lambda values: 0.0, description=_describe_trajectories,
     ),
 }  # fmt: skip
 #: The first one of an ensemble is its default.
@@ -110,6 +127,10 @@ class ThermostatKeys(Section):
     """Friction of langevin on rotation; default: friction_translation_per_ps"""
     nose_hoover_links: Annotated[int, Strict(), Field(ge=1, le=100)] = 3
     """Links of each Nose-Hoover chain"""
+    trajectory_steps: Annotated[int, Strict(), Field(ge=1, le=100_000)] | None = None
+    """Steps of a trajectory of hybrid_monte_carlo, after which it is accepted or rejected; default: those of 0.1 ps"""
+    momentum_refreshment: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Fraction of the variance of each momentum that hybrid_monte_carlo draws anew before a trajectory; 1: all of it"""
 
 
 class BarostatKeys(Section):

@@ -321,12 +321,14 @@ class MolecularScene(Scene):
                 continue
             of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
             for key, wanted in [*of_run, *of_stage]:
-                taken = wanted and max(1, round(wanted * 1000 / stage.timestep_fs)) * stage.timestep_fs / 1000
+                taken = wanted and stage.steps_of(wanted) * stage.timestep_fs / 1000
                 if wanted and abs(taken - wanted) > 1e-9 * wanted:
-                    found.setdefault((key, wanted, stage.timestep_fs, taken), []).append(f"stages.{k}")
+                    together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
+                    unit = f"a whole number of {together}steps of {stage.timestep_fs:g} fs"
+                    found.setdefault((key, wanted, unit, taken), []).append(f"stages.{k}")
         return [
-            f"{key} = {wanted:g} is not a whole number of steps of {step:g} fs ({', '.join(where)}): it is {taken:g} ps"
-            for (key, wanted, step, taken), where in found.items()
+            f"{key} = {wanted:g} is not {unit} ({', '.join(where)}): it is {taken:g} ps"
+            for (key, wanted, unit, taken), where in found.items()
         ]
 
     def _uneven_frames(self) -> Iterator[str]:
@@ -338,7 +340,7 @@ class MolecularScene(Scene):
         for k, stage in enumerate(self.stages):
             if stage.is_minimisation:
                 continue
-            every = max(1, round(wanted * 1000 / stage.timestep_fs))
+            every = stage.steps_of(wanted)
             uneven = stage.steps % every and k < len(self.stages) - 1
             if stage.is_auto:
                 yield f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}"

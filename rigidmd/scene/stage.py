@@ -1,6 +1,7 @@
 """The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a minimisation."""
 
 # isort: skip_file
+from math import inf, log
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -12,6 +13,7 @@ from rigidmd.scene.couplings import (
 )  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import Count, Line, NameIn, Positive, Section
+from rigidmd.units import FEMTOSECOND
 
 MOST_STEPS = 1e12
 
@@ -130,6 +132,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             yield f"{', '.join(idle)} would do nothing {self._where([_users(key) for key in idle])}"
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
+        if self.integrator in WITH_THERMOSTAT and self.is_hybrid:
+            yield f"{self.integrator} contains a thermostat of its own: name another integrator for hybrid_monte_carlo"
         if self.changes_box:
             yield from self._pressure_errors()
         if self.has_barostat:
@@ -137,7 +141,11 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         yield from self._rotor_errors()
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
         step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
-        yield from auto_errors(self.integrator, targets, step_keys)
+        if self.is_hybrid and self.is_auto:
+            if given := [key for key, target in targets.items() if target is not None]:
+                yield f"{', '.join(given)} would do nothing: averages of hybrid_monte_carlo have no error of the step"
+        else:
+            yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
             yield f"bias_kT is for averages at a temperature, and {self.ensemble} has no thermostat"
         if not self.duration * 1000 / self.timestep_fs < MOST_STEPS:
@@ -199,7 +207,28 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
 
     @property
     def steps(self) -> int:
-        return round(self.duration * 1000 / self.timestep_fs)
+        return self.steps_of(self.duration) if self.duration else 0
+
+    def steps_of(self, interval: float) -> int:
+        """The nearest number of steps to an interval (ps), at least one step or trajectory."""
+        together = self.steps_together
+        return max(1, round(interval * 1000 / (self.timestep_fs * together))) * together
+
+    @property
+    def steps_together(self) -> int:
+        """Steps of a trajectory of hybrid Monte Carlo, between which nothing is observed; else 1."""
+        return int(self.thermostat_values["trajectory_steps"]) if self.is_hybrid else 1
+
+    @property
+    def is_hybrid(self) -> bool:
+        """Whether the stage samples by hybrid Monte Carlo."""
+        return self.thermostat_kind == "hybrid_monte_carlo"
+
+    @property
+    def refreshment_rate(self) -> float:
+        """The friction (1/ps) that draws the momenta of hybrid Monte Carlo anew in one step; infinite for all of it."""
+        kept = 1 - self.momentum_refreshment
+        return -log(kept) / (2 * self.timestep_fs * FEMTOSECOND) if kept else inf
 
     @property
     def duration(self) -> float:
@@ -306,7 +335,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def moves_every(self) -> int:
         """Steps between two moves of the box."""
-        return max(1, round(self.barostat_values["barostat_interval_ps"] * 1000 / self.timestep_fs))
+        return self.steps_of(self.barostat_values["barostat_interval_ps"])
 
     @property
     def compressibility(self) -> float:

@@ -20,6 +20,7 @@ from rigidmd.core.state import (
 from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
+from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_workspace
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.dynamics.step_loop import Advance, advance_body, flow_arrays, molecule_code
@@ -36,9 +37,10 @@ from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
 
 Precision = Literal["double", "mixed"]
-#: Owners of arrays in `Engine.memory` besides the terms, and the arrays of a barostat.
-LOAD, BOX = "load", "box"
+#: Owners of arrays in `Engine.memory` besides the terms; the arrays of a barostat, and of hybrid Monte Carlo.
+LOAD, BOX, TRAJECTORY = "load", "box", "trajectory"
 BOX_FIELDS = ("tally", "known", "counts")
+TRAJECTORY_FIELDS = ("energies", "known", "sums")
 
 #: dt, `until` and `observed` of `Engine.advance`.
 Steps = tuple[float, int, bool]
@@ -77,6 +79,7 @@ class CpuEngine(Engine):
         self._dispatchers: dict[str, TermDispatcher] = {}
         self._evaluated: Load | None = None
         self._box_workspace: BarostatWorkspace | None = None
+        self._trajectory: TrajectoryWorkspace | None = None
         self._stale = True
         self._first = True
         self._checked: State | None = None
@@ -146,13 +149,15 @@ class CpuEngine(Engine):
 
     def _flow_arguments(self, integrator: Scheme, state: State) -> tuple:
         """The arguments of the compiled step loop that depend on the integrator."""
-        probe = box = None
+        probe = box = trajectory = None
         if integrator.has_gradient:
             probe = self._probe = self._probe or gradient_workspace(state)
         if integrator.barostat is not None:
             box = self._box_workspace = self._box_workspace or barostat_workspace(state)
+        if integrator.trajectory_steps:
+            trajectory = self._trajectory = self._trajectory or trajectory_workspace(state)
         flows = integrator.thermostat or NoThermostat(), integrator.barostat or NoBarostat(), flow_arrays(integrator)
-        return *flows, probe, self._heat, box
+        return *flows, probe, self._heat, box, trajectory
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
@@ -210,6 +215,8 @@ class CpuEngine(Engine):
             owners[LOAD] = self.load._asdict()
         if self._box_workspace is not None:
             owners[BOX] = {key: getattr(self._box_workspace, key) for key in BOX_FIELDS}
+        if self._trajectory is not None:
+            owners[TRAJECTORY] = {key: getattr(self._trajectory, key) for key in TRAJECTORY_FIELDS}
         return {f"{owner}.{key}": array for owner, arrays in owners.items() for key, array in arrays.items()}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
@@ -218,7 +225,7 @@ class CpuEngine(Engine):
         for name, array in memory.items():
             owner, _, key = name.rpartition(".")
             kept.setdefault(owner, {})[key] = array
-        if unknown := kept.keys() - {*self.names, LOAD, BOX}:
+        if unknown := kept.keys() - {*self.names, LOAD, BOX, TRAJECTORY}:
             raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
         self._recall_lists(state, kept)
         self.load, self._stale = no_load(state), LOAD not in kept
@@ -230,6 +237,12 @@ class CpuEngine(Engine):
             _copy_into(box, kept[BOX])
             if box.known[0] not in (0, 1) or not 0 <= box.counts[1] <= box.counts[0]:
                 raise ValueError("the numbers of tried and accepted moves of the box are invalid")
+        if TRAJECTORY in kept:
+            self._trajectory = trajectory_workspace(state)
+            _copy_into(self._trajectory, kept[TRAJECTORY])
+            ended, accepted = self._trajectory.sums[:2]
+            if self._trajectory.known[0] not in (0, 1) or not 0 <= accepted <= ended:
+                raise ValueError("the numbers of ended and accepted trajectories are invalid")
         if LOAD in kept and not self._python_forces:
             self._check_recalled(state, kept)
 
@@ -253,13 +266,17 @@ class CpuEngine(Engine):
                 raise ValueError(f"its state has another {name} than was kept with it")
         lists = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
         same = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
-        if BOX in kept:
-            if self._box_workspace is not None and self._box_workspace.known[0]:
-                terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
-                differs = np.abs(terms.sum(0) - self._box_workspace.tally[0]) > rounding * np.abs(terms).sum(0).max()
-                if differs[int(self._setup.needs_virials) :].any():  # a piston needs no energies
+        if BOX in kept or TRAJECTORY in kept:
+            terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
+            box, trajectory = self._box_workspace, self._trajectory
+            first = int(self._setup.needs_virials)  # a piston needs no energies
+            there = [box.tally[0, first:]] if box is not None and box.known[0] else []
+            there += [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
+            for values in there:
+                found = terms.sum(0)[first : first + len(values)]
+                if (np.abs(found - values) > rounding * np.abs(terms).sum(0).max()).any():
                     raise ValueError("its state has another energy or virial than was kept with it")
-            if not same:  # they were built for a trial box that was rejected
+            if not same:  # they were built for a trial box or the end of a trajectory that was rejected
                 self._recall_lists(state, kept)
         elif not same:
             raise ValueError("its neighbour lists are not those of its state")
@@ -267,6 +284,10 @@ class CpuEngine(Engine):
     @property
     def moves(self) -> tuple[int, int]:
         return (0, 0) if (box := self._box_workspace) is None else (int(box.counts[0]), int(box.counts[1]))
+
+    @property
+    def trajectories(self) -> np.ndarray | None:
+        return None if self._trajectory is None else self._trajectory.sums.copy()
 
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code. Their arrays show the memory needed."""

@@ -1,0 +1,136 @@
+"""Trajectories of hybrid Monte Carlo: their start, and the Metropolis test of their end.
+
+A trajectory is some steps of any scheme. Its momenta are drawn anew, in whole or in part, and its end is accepted with
+the probability min(1, exp(-dH/kT)). Otherwise positions and orientations return to its start, momenta with the opposite
+sign. The scheme is reversible and keeps volumes in phase space, so exp(-H/kT) is sampled exactly, whatever the step is
+(Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216). See the theory chapter `sampling`.
+"""
+
+from math import exp, inf, isnan, log
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import chosen_by_type, is_a, kernel
+from rigidmd.core.state import HEAT, NOW, OK, Load, State, no_load
+from rigidmd.dynamics.noise import uniforms
+from rigidmd.dynamics.thermostats import HybridMonteCarlo, kinetic_energies_of, ramp_value
+from rigidmd.forces.terms import WITH_ENERGIES, compute_load, copy
+
+#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)) and
+#: of exp(-dH/kT), whose mean is 1 in equilibrium.
+ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
+#: Largest -dH/kT in `WEIGHTS`, so that sums stay finite where energies fall from a bad start.
+LARGEST = 600.0
+
+
+class TrajectoryWorkspace(NamedTuple):
+    """The start of a trajectory."""
+
+    position: np.ndarray  # as in State
+    velocity: np.ndarray
+    rotation: np.ndarray
+    angular_momentum_body: np.ndarray
+    load: Load
+    energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
+    known: np.ndarray  # (1,) whether the potential is that of the present positions
+    sums: np.ndarray  # (5,) see ENDED
+
+
+def trajectory_workspace(state: State) -> TrajectoryWorkspace:
+    arrays = (array.copy() for array in state[:4])
+    return TrajectoryWorkspace(*arrays, no_load(state), np.zeros(2), np.zeros(1, np.int64), np.zeros(5))
+
+
+@kernel
+def potential_energy(terms, state, load, progress):
+    """Status code and potential energy of the present positions, with forces if these are unknown. progress : see
+    `dynamics.step_loop.advance`"""
+    if progress[1] != 1 or terms.tallies_valid[0] == 0:
+        progress[1] = 0
+        status = compute_load(terms, state, load, WITH_ENERGIES)
+        if status != OK:
+            return status, 0.0
+        progress[1] = 1
+    total = 0.0
+    for tally in terms.tallies:
+        total += tally[0]
+    return OK, total
+
+
+@chosen_by_type
+def start_or_test_trajectory(
+    thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw
+):  # fmt: skip
+    """Keep the present state as the start of a trajectory; or accept it as its end, or return to the start. A status
+    code. blocks : see `thermostat_workspace`"""
+    if is_a(thermostat, HybridMonteCarlo):
+        return _start_or_test
+    return lambda thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw: OK
+
+
+def _start_or_test(thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw):
+    potential = workspace.energies[0]
+    if not starts or workspace.known[0] == 0 or progress[1] != 1:
+        status, potential = potential_energy(terms, state, load, progress)
+        if status != OK:
+            return status
+    moving, turning = kinetic_energies_of(model, code, state, blocks)
+    kinetic = moving + turning
+    if starts:
+        workspace.energies[0], workspace.energies[1] = potential, kinetic
+        copy_start(state, load, workspace, workspace.load)
+        return OK
+    gained = potential - workspace.energies[0] + (kinetic - workspace.energies[1])
+    loss = gained / ramp_value(thermostat.thermal_energy, state)
+    if isnan(loss):
+        loss = inf
+    u, _ = uniforms(thermostat.key, draw, 0, state.step[NOW])
+    sums = workspace.sums
+    sums[ENDED] += 1
+    sums[SIZES] += abs(loss)
+    sums[CHANCES] += exp(min(0.0, -loss))
+    sums[WEIGHTS] += exp(min(LARGEST, -loss))
+    workspace.known[0] = 1
+    if log(u) < -loss:
+        sums[ACCEPTED] += 1
+        workspace.energies[0] = potential
+        state.energy_ledger[HEAT] += gained
+    else:
+        copy_start(workspace, workspace.load, state, load)
+        negate(state.velocity)
+        negate(state.angular_momentum_body)
+        terms.tallies_valid[0] = 0
+    return OK
+
+
+@chosen_by_type
+def know_potential(thermostat, workspace, barostat_workspace):
+    """Take the potential energy from a move of the box that has just been accepted or rejected."""
+    if not is_a(thermostat, HybridMonteCarlo):
+        return lambda thermostat, workspace, barostat_workspace: None
+
+    def know(thermostat, workspace, barostat_workspace):
+        if barostat_workspace is not None:
+            workspace.energies[0] = barostat_workspace.tally[0, 0]
+
+    return know
+
+
+@kernel
+def copy_start(source, load, target, load_there):
+    """Copy what a trajectory changes, from `source` to `target`: a state and a workspace, each with a load."""
+    copy(source.position, target.position)
+    copy(source.velocity, target.velocity)
+    copy(source.rotation, target.rotation)
+    copy(source.angular_momentum_body, target.angular_momentum_body)
+    copy(load.force, load_there.force)
+    copy(load.torque_body, load_there.torque_body)
+
+
+@kernel
+def negate(values):
+    """values[:] *= -1 for an array (n, 3), in place."""
+    for m in range(len(values)):
+        for k in range(3):
+            values[m, k] = -values[m, k]
