@@ -92,6 +92,10 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         faults = [f"stages.{k}: {stage.ensemble} {why}" for k, stage in enumerate(scene.stages) if stage.changes_box]
         if faults:
             raise SceneError(scene.source, faults)
+    driven = [name for name, term in system.terms.items() if getattr(type(term), "time_dependent", False)]
+    if faults := [f"stages.{k}" for k, stage in enumerate(scene.stages) if stage.is_hybrid and driven]:
+        why = f"hybrid_monte_carlo needs an energy that does not depend on time, and {', '.join(driven)} do"
+        raise SceneError(scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults])
     check_memory(system)
     system.notes.extend(scene.rounded_times())
     system.notes.extend(

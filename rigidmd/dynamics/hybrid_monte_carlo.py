@@ -17,8 +17,8 @@ from rigidmd.dynamics.noise import uniforms
 from rigidmd.dynamics.thermostats import HybridMonteCarlo, kinetic_energies_of, ramp_value
 from rigidmd.forces.terms import WITH_ENERGIES, compute_load, copy
 
-#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)) and
-#: of exp(-dH/kT), whose mean is 1 in equilibrium.
+#: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)),
+#: and of exp(-dH/kT), whose mean is 1 in equilibrium.
 ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
 #: Largest -dH/kT in `WEIGHTS`, so that sums stay finite where energies fall from a bad start.
 LARGEST = 600.0
@@ -60,16 +60,22 @@ def potential_energy(terms, state, load, progress):
 
 @chosen_by_type
 def start_or_test_trajectory(
-    thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw
+    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
 ):  # fmt: skip
     """Keep the present state as the start of a trajectory; or accept it as its end, or return to the start. A status
     code. blocks : see `thermostat_workspace`"""
-    if is_a(thermostat, HybridMonteCarlo):
-        return _start_or_test
-    return lambda thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw: OK
+    return _start_or_test if is_a(thermostat, HybridMonteCarlo) else _do_nothing
 
 
-def _start_or_test(thermostat, model, code, terms, state, load, blocks, workspace, progress, starts, draw):
+def _do_nothing(
+    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
+):  # fmt: skip
+    return OK
+
+
+def _start_or_test(
+    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
+):  # fmt: skip
     potential = workspace.energies[0]
     if not starts or workspace.known[0] == 0 or progress[1] != 1:
         status, potential = potential_energy(terms, state, load, progress)
@@ -101,6 +107,8 @@ def _start_or_test(thermostat, model, code, terms, state, load, blocks, workspac
         negate(state.velocity)
         negate(state.angular_momentum_body)
         terms.tallies_valid[0] = 0
+        if barostat_workspace is not None:
+            barostat_workspace.known[0] = 0
     return OK
 
 

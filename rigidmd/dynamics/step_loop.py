@@ -93,8 +93,8 @@ def advance(
                 if gradient_workspace is None:
                     if progress[1] == 0:
                         now = state.step[NOW] + 1
-                        last = k > flows.last and (observed and now == until or is_tested(flows, now - state.step[ORIGIN]))
-                        which = WITH_ENERGIES if last else FORCES_ONLY
+                        needed = (observed and now == until) or is_tested(flows, now - state.step[ORIGIN])
+                        which = WITH_ENERGIES if needed and k > flows.last else FORCES_ONLY
                         status = compute_step_load(barostat, terms, state, load, barostat_workspace, flows, which)
                         if status != OK:
                             return status
@@ -127,10 +127,11 @@ def advance(
                         return status
                     know_potential(thermostat, trajectory_workspace, barostat_workspace)
                 elif flows.kind[k] == BEGIN_TRAJECTORY or flows.kind[k] == END_TRAJECTORY:
+                    starts = flows.kind[k] == BEGIN_TRAJECTORY
                     status = start_or_test_trajectory(
                         thermostat, model, code, terms, state, load, thermostat_workspace, trajectory_workspace,
-                        progress, flows.kind[k] == BEGIN_TRAJECTORY, DRAWS * k
-                    )
+                        barostat_workspace, progress, starts, DRAWS * k
+                    )  # fmt: skip
                     if status != OK:
                         return status
                 elif flows.kind[k] == SCALE_BOX:

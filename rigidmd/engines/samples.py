@@ -24,6 +24,7 @@ class Column(NamedTuple):
     about: str
 
 
+TRAJECTORIES = "the trajectories of hybrid Monte Carlo since the line before"
 UNBIASED = "without the error of the step (velocity Verlet only)"
 
 
@@ -61,6 +62,9 @@ class Sample(NamedTuple):
     pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
     pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
     pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
+    acceptance: Annotated[float, Column("Acceptance", "1", f"fraction of {TRAJECTORIES} that were accepted")]
+    abs_dH_kT: Annotated[float, Column("abs(dH) (kT)", "kT", f"mean size of the error of the energy of {TRAJECTORIES}")]
+    exp_minus_dH: Annotated[float, Column("exp(-dH/kT)", "1", f"mean over {TRAJECTORIES}; in equilibrium 1 on average")]
     conserved: Annotated[float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
     user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol
@@ -80,6 +84,8 @@ def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
     return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
 
 
+#: Columns that only scenes with hybrid Monte Carlo write.
+OF_TRAJECTORIES = ("acceptance", "abs_dH_kT", "exp_minus_dH")
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 

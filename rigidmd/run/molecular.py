@@ -331,8 +331,14 @@ class MolecularRun(RunPart):
         is_verlet = stage.integrator == "velocity_verlet" and not (stage.is_minimisation or stage.is_hybrid)
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
+        trajectories = (nan, nan, nan)
+        if (sums := self.engine.trajectories) is not None:
+            samples = self._sampler.samples
+            of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage
+            ended, accepted, sizes, _, weights = (sums - of_stage * self._sampler.trajectories).tolist()
+            trajectories = (accepted / ended, sizes / ended, weights / ended) if ended else trajectories
         return observe(
-            self.system, self.engine, self.state, moment.stage, time=moment.time, moved=True,
+            self.system, self.engine, self.state, moment.stage, time=moment.time, moved=True, trajectories=trajectories,
             origin=self._sampler.origin(moment.stage) if conserves else nan,
             verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
         )  # fmt: skip

@@ -34,7 +34,8 @@ class LogFile(GrowingFile):
         self.interval, self._tensor = interval, tensor
 
     def begin(self, run: "Simulation") -> None:
-        self._file = Log(run.path(LOG), self._tensor, self.kept, tuple(run.system.user_terms))
+        hybrid = any(stage.is_hybrid for stage in run.scene.stages)
+        self._file = Log(run.path(LOG), self._tensor, self.kept, tuple(run.system.user_terms), hybrid)
 
     def see(self, moment: Moment) -> None:
         self._file.write(moment.sample)
@@ -82,7 +83,7 @@ def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, sta
 class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that passed."""
 
-    remembers: ClassVar[dict[str, Any]] = {"table": np.ndarray}
+    remembers: ClassVar[dict[str, Any]] = {"table": np.ndarray, "trajectories": np.ndarray}
     ends = reads_energies = True
     _names = (LAST_GOOD,)
 
@@ -91,6 +92,7 @@ class Sampler(Observer):
         self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.user_terms))
         self.last_good: State | None = None
         self._run, self._check = run, check
+        self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
         self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
 
     def origin(self, stage: int) -> float | None:
@@ -101,6 +103,8 @@ class Sampler(Observer):
         run, now, samples = self._run, moment.sample, self.samples
         since = self._begins.setdefault(now.stage, max(0, len(samples) - 1))
         samples.append(now)
+        if (trajectories := run.part.engine.trajectories) is not None:
+            self.trajectories = trajectories
         stage = run.scene.stages[now.stage]
         if stage.has_thermostat:
             since = samples.latest(now.time - stage.thermostat_time, since)

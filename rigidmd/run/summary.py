@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 #: Columns of which stages have means -> the units in the keys.
 TEMPERATURES = {name: "K" for name in COLUMNS if name.startswith("temperature")}
 BOX = {"density": "g_cm3", "a": "A", "b": "A", "c": "A"}
+HYBRID = {"acceptance": "mean", "abs_dH_kT": "mean", "exp_minus_dH": "mean"}
 #: Keys of a stage that are None for a minimisation.
 MOTION_KEYS = (
     "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "means_over", "equilibrated_from_ps",
@@ -35,6 +36,8 @@ MOTION_KEYS = (
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
 #: Drift of the conserved energy per degree of freedom, kT/ns, and its sum over the time, kT.
 DRIFT_LIMIT, DRIFT_SUM_LIMIT = 0.1, 1e-3
+#: Smallest fraction of accepted trajectories of hybrid Monte Carlo without a note.
+LEAST_ACCEPTANCE = 0.2
 #: Error of the temperature by the step, and difference of T_trans and T_rot, as fractions.
 HEATING_LIMIT, DIFFERENCE_LIMIT = 0.01, 0.01
 #: Largest fraction of T_trans in a common drift of all molecules without a note. Where the total momentum is thermal:
@@ -163,6 +166,15 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
         return []
     time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
     found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
+    if stage.is_hybrid:  # its averages have no error of the step
+        accepted = float(of_stage["acceptance"][half:].mean())
+        if accepted > LEAST_ACCEPTANCE:
+            return []
+        return [
+            f"stages.{k}: in its second half {accepted:.1%} of the trajectories were accepted: positions hardly "
+            f"change and the errors of the means are too small. Try a shorter timestep_fs than {stage.timestep_fs:g}, "
+            "an integrator of higher order such as 'srkn_4', or integrator = 'auto'"
+        ]
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     if thermal > 0 and abs(line.value) > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error:
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
@@ -244,7 +256,9 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
         **temperatures, "potential_kJ_mol_per_molecule": potential[0],
         "potential_error_kJ_mol_per_molecule": potential[1],
         "pressure_bar": pressure[0], "pressure_error_bar": pressure[1],
-        **(_means(steady, BOX) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
+        **(_means(steady, BOX) if stage.has_barostat else {}), **(_means(steady, HYBRID) if stage.is_hybrid else {}),
+        "trajectories": steps // stage.steps_together if stage.is_hybrid else None,
+        "moves_tried": moves[0], "moves_accepted": moves[1],
         "drift_verdict": _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal) if duration else None,
         "drift_kJ_mol_ns_per_molecule": _finite_or_none(line.value * 1000 / n),
         "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
