@@ -44,6 +44,7 @@ THERMOSTATS = {
     "langevin": {"friction_translation_per_ps": 10.0},
     "nose_hoover": {"thermostat_time_ps": 0.1},
     "andersen": {"thermostat_time_ps": 0.1},
+    "hybrid_monte_carlo": {"trajectory_steps": 20},
 }
 WARM = {"ensemble": "nvt", "thermostat": "langevin", "friction_translation_per_ps": 10.0}
 
@@ -361,7 +362,7 @@ MOMENT = 1.1128 * (0.58588 - 0.1546)  # e Å
 
 
 def orientations(thermostat: dict, step: float, duration: float, interval: float, molecules: int) -> tuple:
-    """Mean cosine between dipole and field of 1 V/nm at 300 K, over time; its exact mean."""
+    """Mean cosine between dipole and field of 1 V/nm at 300 K, over time; its exact mean; the results."""
     direction = np.array([0.6, 0.0, 0.8])
     stage = {"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": step} | thermostat
     scene = {
@@ -377,7 +378,7 @@ def orientations(thermostat: dict, step: float, duration: float, interval: float
     axis = 0.5 * (sites[:, :, 1] + sites[:, :, 2]) - sites[:, :, 0]
     cosine = axis @ direction / np.linalg.norm(axis, axis=2)
     x = MOMENT * VOLT_PER_NM / (BOLTZMANN * 300.0)
-    return cosine.mean(axis=1), float(1 / np.tanh(x) - 1 / x)
+    return cosine.mean(axis=1), float(1 / np.tanh(x) - 1 / x), course.results
 
 
 @pytest.mark.soak
@@ -386,20 +387,36 @@ def test_a_dipole_in_a_field():
     friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
     for name, thermostat, step in (("langevin", friction, 2.0), ("andersen", {"thermostat": "andersen",
                                     "thermostat_time_ps": 0.1}, 2.0)):  # fmt: skip
-        cosine, exact = orientations(thermostat, step, 120.0, 0.2, 2000)
+        cosine, exact, _ = orientations(thermostat, step, 120.0, 0.2, 2000)
         error = error_of(cosine)
         assert error < 5e-4
         assert told(f"<cos> of a dipole, {name}, {step:g} fs", cosine.mean(), error, exact) < FEW
         assert cosine.mean() == pytest.approx(exact, abs=1e-3)
-    cosine, exact = orientations(friction, 20.0, 120.0, 0.2, 2000)
+    cosine, exact, _ = orientations(friction, 20.0, 120.0, 0.2, 2000)
     told("<cos> of a dipole, langevin, 20 fs", cosine.mean(), error_of(cosine), exact)
 
 
 def test_a_few_dipoles_in_a_field():
     """The same to 1 %, in seconds."""
-    cosine, exact = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)
+    cosine, exact, _ = orientations({"thermostat": "langevin", "friction_translation_per_ps": 15.0}, 4.0, 8.0, 0.2, 400)
     assert error_of(cosine) < 0.01 * exact
     assert told("<cos>", cosine.mean(), error_of(cosine), exact) < MANY
+
+
+def test_dipoles_at_a_long_step_by_hybrid_monte_carlo():
+    """The same to 1e-3 at 20 fs, where Langevin's thermostat is off by many errors; <exp(-dH/kT)> = 1."""
+    hybrid = {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 10}
+    cosine, exact, results = orientations(hybrid, 20.0, 800.0, 0.2, 400)
+    error = error_of(cosine)
+    assert error < 5e-4
+    assert told("<cos>, hybrid Monte Carlo, 20 fs", cosine.mean(), error, exact) < MANY
+    assert cosine.mean() == pytest.approx(exact, abs=1e-3)
+    weight = results["exp_minus_dH"][results["stage"] == 1]
+    assert told("<exp(-dH/kT)>", weight.mean(), error_of(weight), 1.0) < MANY
+    assert 0.3 < results["acceptance"][results["stage"] == 1].mean() < 0.9  # so that the test is of rejections too
+    friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
+    cosine, exact, _ = orientations(friction, 20.0, 200.0, 0.2, 400)
+    assert told("<cos>, langevin, 20 fs", cosine.mean(), error_of(cosine), exact) > 5
 
 
 # Liquids and crystals at a pressure.

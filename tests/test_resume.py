@@ -80,6 +80,10 @@ ENSEMBLES = {
     "langevin": (NVT | {"thermostat": "langevin"}, NVE),
     "nose_hoover": (NVT | {"thermostat": "nose_hoover"}, NPH),
     "andersen": (NVT | {"thermostat": "andersen"}, NVE | {"integrator": "srkn_4"}),
+    "hybrid_monte_carlo": (
+        NVT | {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 4, "timestep_fs": 6.0},
+        NPT | {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 3, "momentum_refreshment": 0.4},
+    ),
     "monte_carlo": (NPT | {"barostat": "monte_carlo"}, NVE | {"integrator": "position_verlet"}),
     "flexible": (NPT | {"thermostat": "langevin", "pressure_coupling": "flexible"}, NVE | {"integrator": "chin_4a"}),
     "minimise": (MINIMISE, NVT, MINIMISE, NVE),
@@ -87,10 +91,13 @@ ENSEMBLES = {
 }
 
 
+KEPT = ("nose_hoover", "hybrid_monte_carlo")
+
+
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [  # in the default tier the one whose thermostat has variables of its own
-        pytest.param(*which, marks=[] if which == ("nose_hoover", "double") else pytest.mark.soak)
+    [  # in the default tier those whose thermostat has variables of its own
+        pytest.param(*which, marks=[] if which[0] in KEPT and which[1] == "double" else pytest.mark.soak)
         for which in product(ENSEMBLES, ("double", "mixed"))
     ],
 )

@@ -84,7 +84,8 @@ def test_andersen_has_its_time():
 
 
 @pytest.mark.parametrize(
-    ("kind", "kept"), [("velocity_rescaling", 3), ("nose_hoover", 3), ("langevin", 0), ("andersen", 0)]
+    ("kind", "kept"),
+    [("velocity_rescaling", 3), ("nose_hoover", 3), ("langevin", 0), ("andersen", 0), ("hybrid_monte_carlo", 0)],
 )
 def test_temperatures_count_the_total_momentum_where_the_thermostat_changes_it(kind, kept):
     system = system_of(NVT | {"thermostat": kind})

@@ -297,12 +297,14 @@ class MolecularRun(RunPart):
 
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
+        from rigidmd.run.pilot.acceptance import choose_for_sampling
         from rigidmd.run.pilot.shadow import choose_for_averages
         from rigidmd.run.pilot.trial_systems import choose_for_molecules
 
         stage = self.scene.stages[k]
         self.simulation.announce("choosing integrator and step by pilot runs")
         choose = choose_for_averages if stage.bias_kT else choose_for_molecules
+        choose = choose_for_sampling if stage.is_hybrid else choose
         decided, reason = choose(self.system, self.state, k)
         self.record.choices[k] = f"{decided.integrator} at {decided.timestep_fs:g} fs chosen: {reason}"
         stages = self.record.stages
