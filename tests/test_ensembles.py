@@ -403,20 +403,20 @@ def test_a_few_dipoles_in_a_field():
     assert told("<cos>", cosine.mean(), error_of(cosine), exact) < MANY
 
 
-def test_dipoles_at_a_long_step_by_hybrid_monte_carlo():
-    """The same to 1e-3 at 20 fs, where Langevin's thermostat is off by many errors; <exp(-dH/kT)> = 1."""
-    hybrid = {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 10}
-    cosine, exact, results = orientations(hybrid, 20.0, 800.0, 0.2, 400)
+@pytest.mark.parametrize(("duration", "largest"), [(350.0, 8e-4), pytest.param(3000.0, 3e-4, marks=pytest.mark.soak)])
+def test_dipoles_at_a_long_step_by_hybrid_monte_carlo(duration, largest):
+    """The same at 20 fs, where velocity Verlet with Langevin's thermostat is off by many errors; <exp(-dH/kT)> = 1."""
+    hybrid = {"thermostat": "hybrid_monte_carlo", "trajectory_steps": 5}
+    cosine, exact, results = orientations(hybrid, 20.0, duration, 0.1, 400)
     error = error_of(cosine)
-    assert error < 5e-4
-    assert told("<cos>, hybrid Monte Carlo, 20 fs", cosine.mean(), error, exact) < MANY
-    assert cosine.mean() == pytest.approx(exact, abs=1e-3)
+    assert error < largest
+    assert told("<cos>, hybrid Monte Carlo, 20 fs", cosine.mean(), error, exact) < FEW
     weight = results["exp_minus_dH"][results["stage"] == 1]
     assert told("<exp(-dH/kT)>", weight.mean(), error_of(weight), 1.0) < MANY
-    assert 0.3 < results["acceptance"][results["stage"] == 1].mean() < 0.9  # so that the test is of rejections too
-    friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0}
-    cosine, exact, _ = orientations(friction, 20.0, 200.0, 0.2, 400)
-    assert told("<cos>, langevin, 20 fs", cosine.mean(), error_of(cosine), exact) > 5
+    assert 0.4 < results["acceptance"][results["stage"] == 1].mean() < 0.8  # so that the test is of rejections too
+    friction = {"thermostat": "langevin", "friction_translation_per_ps": 15.0, "integrator": "velocity_verlet"}
+    cosine, exact, _ = orientations(friction, 20.0, 100.0, 0.2, 400)
+    assert told("<cos>, velocity Verlet with langevin, 20 fs", cosine.mean(), error_of(cosine), exact) > 5
 
 
 # Liquids and crystals at a pressure.
