@@ -212,7 +212,7 @@ def test_degrees_of_freedom_follow_the_thermostat():
     ("stage", "message"),
     [
         ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "berendsen"},
-         "samples no ensemble.*The thermostats are velocity_rescaling, langevin, nose_hoover, andersen$"),
+         "samples no ensemble.*The thermostats are velocity_rescaling, langevin, nose_hoover, andersen, hybrid_monte_carlo$"),
         ({"ensemble": "nvt", "temperature_K": 300.0, "friction_translation_per_ps": 1.0}, "would do nothing with velo"),
         ({"ensemble": "nvt", "temperature_K": 300.0, "thermostat": "langevin", "friction_translation_per_ps": 0.0},
          "must be greater than 0"),

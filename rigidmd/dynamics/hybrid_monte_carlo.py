@@ -33,7 +33,7 @@ class TrajectoryWorkspace(NamedTuple):
     angular_momentum_body: np.ndarray
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
-    known: np.ndarray  # (1,) whether the potential is that of the present positions
+    known: np.ndarray  # (1,) whether the potential energy belongs to the present positions
     sums: np.ndarray  # (5,) see ENDED
 
 

@@ -31,6 +31,7 @@ class Coupling(NamedTuple):
     #: For a thermostat: whether it acts on each molecule by itself, so that the total momentum is not conserved and
     #: diffusion and spectra change; its time constant (ps) and its description by the values of its keys.
     on_molecules: bool = False
+    in_trajectories: bool = False  # whether steps are accepted or rejected together
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
     #: For a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
@@ -89,7 +90,7 @@ THERMOSTATS = {
         "Duane, Kennedy, Pendleton & Roweth 1987, Phys. Lett. B 195, 216",
         {"trajectory_steps": lambda stage: max(1, round(TRAJECTORY_PS * 1000 / stage.timestep_fs)),
          "momentum_refreshment": 1.0},
-        on_molecules=True, time=lambda values: 0.0, description=_describe_trajectories,
+        on_molecules=True, in_trajectories=True, time=lambda values: 0.0, description=_describe_trajectories,
     ),
 }  # fmt: skip
 #: The first one of an ensemble is its default.

@@ -133,7 +133,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.integrator in WITH_THERMOSTAT and not self.has_thermostat and not self.is_minimisation:
             yield f"{self.integrator} contains a thermostat, but {self.ensemble} has none"
         if self.integrator in WITH_THERMOSTAT and self.is_hybrid:
-            yield f"{self.integrator} contains a thermostat of its own: name another integrator for hybrid_monte_carlo"
+            yield f"{self.integrator} contains a thermostat of its own: name another one for {self.thermostat_kind}"
         if self.changes_box:
             yield from self._pressure_errors()
         if self.has_barostat:
@@ -143,7 +143,8 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
         if self.is_hybrid and self.is_auto:
             if given := [key for key, target in targets.items() if target is not None]:
-                yield f"{', '.join(given)} would do nothing: averages of hybrid_monte_carlo have no error of the step"
+                kind = self.thermostat_kind
+                yield f"{', '.join(given)} would do nothing: averages of {kind} have no error of the step"
         else:
             yield from auto_errors(self.integrator, targets, step_keys)
         if self.bias_kT is not None and not self.has_thermostat:
@@ -222,7 +223,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
     @property
     def is_hybrid(self) -> bool:
         """Whether the stage samples by hybrid Monte Carlo."""
-        return self.thermostat_kind == "hybrid_monte_carlo"
+        return self.has_thermostat and THERMOSTATS[self.thermostat_kind].in_trajectories
 
     @property
     def refreshment_rate(self) -> float:

@@ -20,7 +20,7 @@ from rigidmd.units import FEMTOSECOND
 TRIED = ("velocity_verlet", "two_stage", "srkn_4")
 #: Steps that are tried, as fractions of the longest stable one, and trajectories with each.
 FRACTIONS, TRAJECTORIES = (0.2, 0.28, 0.4, 0.56, 0.8), 16
-#: Steps of the first trajectories, which leave the lattice of a start, where forces tell nothing of a liquid.
+#: Steps of the first trajectories, which leave the lattice of a start, whose forces are not those of a liquid.
 WARMING_STEPS = 20
 #: Length of a trajectory in radians of the rms frequency of all motions. For water it is 0.08 ps. The energies of 64
 #: SPC/E were independent soonest with 0.06 to 0.11 ps; with 0.03 or 0.45 ps they took 1.6 and 2 times as long.
