@@ -13,7 +13,8 @@ if none is left. Then, of each average,
 
 - the bias of a method at a step: its mean less the limit of all engines and methods at a step of zero, one weighted fit
   linear in dt² (`extrapolate`);
-- the variance of a mean over 1 ns: from the scatter of the runs of a method about the mean at their step;
+- the variance of a mean over 1 ns: from the scatter of blocks of 6 ps (for D of 24 ps) about the mean of their run, one
+  variance for all methods; those of single methods over it are printed;
 - the cost: seconds of a processor (user and system) per ns, a median over runs. It hardly depends on what else runs.
 
 The total error after a time t is sqrt(bias² + variance / t); of the square of a bias that of its error is taken off.
@@ -44,7 +45,7 @@ from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 COUNT, TEMPERATURE, DENSITY, CUTOFF, SWITCH = 512, 298.15, 0.997, 9.0, 1.0  # K, g/cm³, Å
 EVERY, RELAXED, FRAMES = 0.12, 50, 450  # ps between frames; frames to relax, and all of a run
 NS = (FRAMES - RELAXED) * EVERY * 1e-3  # sampled by a run
-STARTS = 4
+STARTS, BLOCKS = 4, 8  # blocks of a run, whose scatter is that of its average; two for D
 PEAK = (2.70, 2.80)  # Å, the shell around the first maximum of g(r) in which its height is averaged
 LAGS = (2.0, 8.0)  # ps between which the mean square displacement is taken as a straight line
 KT_PER_FREEDOM = 6 * BOLTZMANN * TEMPERATURE / KJ_PER_MOL  # of a molecule, kJ/mol
@@ -268,12 +269,14 @@ def do(run: Run, folder: Path) -> None:
         except (Failed, RigidMDError) as error:
             run.file(folder).write_text(json.dumps({"failure": str(error)[:300]}) + "\n")
             return
-    late = slice(RELAXED, None)
-    found = {"cost_s_per_ns": cost, "U": float(np.mean(energy[late])) / COUNT}
+    blocks = np.split(np.arange(RELAXED + 1, FRAMES + 1), BLOCKS)
+    halves = np.split(np.arange(RELAXED + 1, FRAMES + 1), 2)
+    found = {"cost_s_per_ns": cost, "U": [float(np.mean(energy[block])) / COUNT for block in blocks]}
     if run.ensemble == "npt":
-        found["density"] = float(np.mean(density[late]))
+        found["density"] = [float(np.mean(density[block])) for block in blocks]
     else:
-        found |= {"peak": peak_height(frames[late], edges[late]), "D": diffusion(frames[late], edges[-1])}
+        found["peak"] = [peak_height(frames[block], edges[block]) for block in blocks]
+        found["D"] = [diffusion(frames[half], edges[-1]) for half in halves]
     run.file(folder).write_text(json.dumps(found) + "\n")
 
 
@@ -337,16 +340,18 @@ def analyse(name: str, found: dict) -> dict:
     """Of a quantity its limit, those of the engines alone, variances of methods over that of all, and points."""
     quantity = QUANTITIES[name]
     values = {
-        (method, step): np.array([result[name] for result in results])
+        (method, step): [np.ravel(result[name]) for result in results]
         for (ensemble, method, step), results in found.items()
         if ensemble == quantity.ensemble and (name != "D" or METHODS[method].motion)
     }
-    squares, freedom = {}, {}
-    for (method, _), x in values.items():
-        squares[method] = squares.get(method, 0.0) + len(x) * x.var()
-        freedom[method] = freedom.get(method, 0) + len(x) - 1
-    variance = sum(squares.values()) / sum(freedom.values())
-    means = {key: MeanAtStep(*key, float(x.mean()), float(np.sqrt(variance / len(x)))) for key, x in values.items()}
+    squares, freedom = {}, {}  # of blocks about the mean of their run, by method
+    for (method, _), blocks in values.items():
+        squares[method] = squares.get(method, 0.0) + sum(float(x.size * x.var()) for x in blocks)
+        freedom[method] = freedom.get(method, 0) + sum(x.size - 1 for x in blocks)
+    pooled = sum(squares.values()) / sum(freedom.values())
+    per_run = pooled / (2 if name == "D" else BLOCKS)
+    means = {key: MeanAtStep(*key, float(np.mean([x.mean() for x in blocks])), float(np.sqrt(per_run / len(blocks))))
+             for key, blocks in values.items()}  # fmt: skip
     fit = extrapolate(list(means.values()))
     scale = quantity.scale or fit.limit
     engines = {}
@@ -357,11 +362,11 @@ def analyse(name: str, found: dict) -> dict:
     for (method, step), mean in means.items():
         costs = [result["cost_s_per_ns"] for result in found[quantity.ensemble, method, step]]
         bias, error = (x / scale for x in fit.bias(mean))
-        spread = float(np.sqrt(variance * NS)) / scale
+        spread = float(np.sqrt(per_run * NS)) / scale
         points.append(
             Point(method, step, len(costs), mean.mean, mean.error, bias, error, float(np.median(costs)), spread)
         )
-    ratios = {m: [squares[m] / freedom[m] / variance, float(np.sqrt(2 / freedom[m]))] for m in squares if freedom[m]}
+    ratios = {m: [squares[m] / freedom[m] / pooled, float(np.sqrt(2 / freedom[m]))] for m in squares if freedom[m]}
     return {"limit": [fit.limit, fit.limit_error], "longest_step_fs": fit.longest, "limits_of_engines": engines,
             "variances_over_that_of_all": ratios, "points": points}  # fmt: skip
 
@@ -377,8 +382,8 @@ def cell(points: list[Point], target: float) -> str:
 
 
 def print_tables(result: dict) -> None:
-    for name, quantity in QUANTITIES.items():
-        one = result[name]
+    for name, one in result.items():
+        quantity = QUANTITIES[name]
         print(f"\n{quantity.title}: limit {one['limit'][0]:.5g} ± {one['limit'][1]:.2g} {quantity.unit}, steps up to "
               f"{one['longest_step_fs']:g} fs")  # fmt: skip
         for engine, (limit, error) in one["limits_of_engines"].items():
@@ -398,11 +403,12 @@ def print_tables(result: dict) -> None:
 
 def draw(result: dict, path: Path) -> None:
     """Total error against computing time: of each method, at each time, with its best step."""
-    figure = Figure(figsize=(10, 8), layout="constrained")
-    for axis, (name, quantity) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
+    figure = Figure(figsize=(4.5 * len(result), 4.8), layout="constrained")
+    for axis, (name, one) in zip(figure.subplots(1, len(result), squeeze=False).flat, result.items(), strict=True):
+        quantity = QUANTITIES[name]
         times = np.geomspace(1, 1e4, 200)
         for method, look in METHODS.items():
-            points = [point for point in result[name]["points"] if point.method == method]
+            points = [point for point in one["points"] if point.method == method]
             if points:
                 errors = np.array([point.total_error(times) for point in points])
                 best = errors.argmin(axis=0)
@@ -439,7 +445,8 @@ def main() -> None:
     while not options.collect and do_next(options.folder, options.rounds):
         pass
     found = read(options.folder)
-    result = {name: analyse(name, found) for name in QUANTITIES}
+    there = {ensemble for ensemble, _, _ in found}
+    result = {name: analyse(name, found) for name, quantity in QUANTITIES.items() if quantity.ensemble in there}
     print_tables(result)
     if options.json:
         versions = [engine.version() for engine in (Rigidmd, Gromacs, OpenMM)]
