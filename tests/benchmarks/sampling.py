@@ -420,7 +420,7 @@ def draw(result: dict, path: Path) -> None:
                 unknown = np.array([point.bias_error for point in points])[best]
                 error = errors.min(axis=0)
                 axis.plot(times, error, ":", color=look.color, lw=1.2)
-                axis.plot(times, np.where(error >= unknown, error, np.nan), color=look.color, lw=1.8, label=method)
+                axis.plot(times, np.where(error >= 2 * unknown, error, np.nan), color=look.color, lw=1.8, label=method)
         for target in quantity.targets:
             axis.axhline(target, color=FAINT, lw=0.8, zorder=0)
         axis.set(xscale="log", yscale="log", xlim=(times[0], times[-1]),
