@@ -506,3 +506,9 @@ def test_the_page_of_models_has_the_tables_of_their_files():
 if __name__ == "__main__":
     text = PAGES["models"].read_text(encoding="utf-8")
     PAGES["models"].write_text(text[: text.index("## Water")] + models_tables(), encoding="utf-8")
+
+
+def test_the_page_of_the_collection_is_written_from_its_data(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
+    import collection
+    assert collection.PAGE.read_text(encoding="utf-8") == collection.page_text()

@@ -33,7 +33,7 @@ SECTIONS = {
     ),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),
-    "evidence": ("benchmarks", "validation"),
+    "evidence": ("benchmarks", "collection", "validation"),
     "project": ("contributing", "architecture", "changelog"),
 }  # fmt: skip
 CHAPTERS = {name: DOCS / folder / f"{name}.md" for folder, names in SECTIONS.items() for name in names}
