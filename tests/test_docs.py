@@ -511,4 +511,5 @@ if __name__ == "__main__":
 def test_the_page_of_the_collection_is_written_from_its_data(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tests" / "benchmarks")
     import collection
+
     assert collection.PAGE.read_text(encoding="utf-8") == collection.page_text()
