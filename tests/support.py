@@ -369,7 +369,7 @@ HOMES = {
     ),
     "studies.accuracy.averages_report": "brief_table describe_failures",
     "io.checkpoint": "Checkpoint latest read_checkpoint write_checkpoint",
-    "figures.style": "AT_ONCE FAINT INK save_figure shown_range",
+    "figures.style": "AT_ONCE FAINT INK curve_style new_figure open_axis save_figure shown_range",
     "io.folder": "CHECKPOINT FINAL FolderLock LOG PREVIOUS check_folder",
     "view.molecule_figure": "models_table write_molecule_figure",
     "figures.picture": "Picture",

@@ -12,12 +12,15 @@ import argparse
 import csv
 import json
 import shlex
+import sys
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from platform import python_version
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "rigidmd" / "docs"
@@ -55,12 +58,13 @@ def command_of(name: str) -> str:
 
 def measure(name: str) -> None:
     """Measure a scene and write its table, picture and advice."""
+    from support import accuracy_report
+
     from rigidmd.scene import Scene, parse_override
-    from rigidmd.studies.accuracy.accuracy import accuracy_figure, measure_accuracy, recommendations, trial_table
 
     _, file, settings = SCENES[name]
     scene = Scene.read(ROOT / "systems" / f"{file}.toml", dict(map(parse_override, settings)))
-    found = measure_accuracy(scene, repeats=REPEATS)
+    found = accuracy_report.measure_accuracy(scene, repeats=REPEATS)
     system, reached = found.trial_system, {}
     for target in TARGETS:
         points = {n: found.time_for(n, "energy_rms", target) for n in dict.fromkeys(t.integrator for t in found.trials)}
@@ -72,11 +76,11 @@ def measure(name: str) -> None:
         "unit": system.time_unit, "span": system.span, "energy_unit": system.energy_unit,
         "order": {n: method.order for n, method in system.methods.items() if any(t.integrator == n for t in found.trials)},
         "median_spread": float(np.median([t.spread for t in found.trials if not t.diverged])),
-        "reference_error": found.reference_error, "reached": reached, "advice": recommendations(found),
+        "reference_error": found.reference_error, "reached": reached, "advice": accuracy_report.recommendations(found),
     }  # fmt: skip
     DATA.mkdir(exist_ok=True)
-    trial_table(found).write(DATA / f"{name}.csv")
-    figure = accuracy_figure(found)
+    accuracy_report.trial_table(found).write(DATA / f"{name}.csv")
+    figure = accuracy_report.accuracy_figure(found)
     figure.lay_out(100)
     figure.savefig(DOCS / "images" / f"collection_{name}.png", dpi=85)
     (DATA / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
