@@ -82,7 +82,7 @@ def test_the_energy_error_is_of_order_two(liquid):
         ("velocity_verlet", 32, 0.1),
         ("chin_4a", 16, 0.2),
         pytest.param("srkn_4", 10, 0.2, marks=pytest.mark.soak),
-        ("srkn_6", 10, 0.3),
+        pytest.param("srkn_6", 10, 0.3, marks=pytest.mark.soak),
     ],
 )
 def test_a_smooth_cut_off_leaves_every_scheme_its_order_in_the_liquid(liquid, name, steps, margin):

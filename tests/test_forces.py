@@ -227,7 +227,7 @@ SLANTED = {"lengths_A": [21.0, 22.0, 23.0], "angles_deg": [70.0, 100.0, 80.0]}
     [
         pytest.param({"lengths_A": 21.0, "periodic": False}, "double", 1e-9, id="none-double"),
         pytest.param({"lengths_A": 21.0}, "double", 1e-9, id="cubic-double"),
-        pytest.param({"lengths_A": 21.0}, "mixed", 2e-6, id="cubic-mixed"),
+        pytest.param({"lengths_A": 21.0}, "mixed", 2e-6, id="cubic-mixed", marks=pytest.mark.soak),
         pytest.param(SLANTED, "double", 1e-9, id="triclinic-double"),
         pytest.param(SLANTED, "mixed", 2e-6, id="triclinic-mixed", marks=pytest.mark.soak),
     ],

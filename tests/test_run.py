@@ -1237,8 +1237,7 @@ ROWS = {
 
 @pytest.mark.parametrize(
     ("name", "precision"),
-    [(name, "double") for name in ROWS]
-    + [pytest.param(name, "mixed", marks=[] if name == "nve" else pytest.mark.soak) for name in ROWS],
+    [(name, "double") for name in ROWS] + [pytest.param(name, "mixed", marks=pytest.mark.soak) for name in ROWS],
 )
 def test_a_look_takes_the_energies_of_the_last_step(name, precision, monkeypatch):
     """They are those of an evaluation, to the bit, and the run goes on as if nobody had looked."""

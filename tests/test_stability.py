@@ -38,7 +38,10 @@ def check(result: CaseResult) -> None:
 
 
 #: Cases whose scenes nothing else compiles.
-APART = ("water_steps", "head_on", "overlaps")
+APART = (
+    "water_steps", "head_on", "overlaps", "bare_charges", "near_linear_molecules", "tip4p_steps", "sleeping_top",
+    "densities", "no_numbers",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -918,7 +918,10 @@ def test_a_thermostat_of_ones_own_takes_the_place_of_that_of_the_stage():
 # --- examples --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.soak] if path.stem == "mie" else []) for path in SCRIPTS],
+)
 def test_every_example_of_an_extension_runs_and_is_short(path, monkeypatch):
     from support import registry
 
