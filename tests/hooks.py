@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 #: Files that take longest with cold kernels, the longest first: a file is run by one worker, so they begin first. By CPU
-#: seconds of a cold run on two cores: 232 of forces, 213 of ewald, 106 of body_engine, 14 of notebook. The first two
+#: seconds of a cold run on two cores: 223 of forces, 232 of docs, 200 of run, 196 of ewald, 25 of notebook. The first two
 #: have no kernels in common, which both workers would compile.
 LONGEST = (
-    "forces", "body_engine", "ewald", "docs", "dynamics", "sweep", "run", "analyse_runs", "ase", "python", "resume",
-    "compile", "bodies", "boxes", "reference", "ensembles", "minimise", "baths", "own", "auto", "lammps", "lanes",
-    "rooms", "looking", "trajectory_structures", "fields", "threads", "body_run", "stability", "accuracy", "notebook",
+    "forces", "body_engine", "ewald", "docs", "run", "dynamics", "resume", "user_code", "compile", "view", "minimise",
+    "sweep", "ase", "simd", "python", "bodies", "threads", "fuzz", "trajectory_structures", "engine_settings",
+    "notebook",
 )  # fmt: skip
 RANKS = {f"test_{name}.py": rank for rank, name in enumerate(LONGEST)}
 

@@ -18,70 +18,8 @@ if TYPE_CHECKING:
 
 SYSTEM, STATE, TOPOLOGY, SCRIPT = "system.xml", "state.xml", "topology.pdb", "run.py"
 
-TEXT = '''"""{title}
-
-Written by rigidmd. It needs OpenMM alone:  python run.py [CPU|CUDA|OpenCL|HIP|Reference]
-"""
-
-import csv
-import sys
-
-import openmm as mm
-from openmm import app
-
-# name, steps, steps between lines, steps between frames, files of the integrator and of what else acts
-STAGES = [
-{stages}
-]
-
-
-def load(name):
-    with open(name) as file:
-        return mm.XmlSerializer.deserialize(file.read())
-
-
-def advance(integrator, steps):
-    """Take steps; the integrator of constant energy begins and ends with half a kick."""
-    if not isinstance(integrator, mm.CustomIntegrator):
-        return integrator.step(steps)
-    for kick, moves, count in ((0.5, 1, 1), (1.0, 1, steps - 1), (0.5, 0, 1)):
-        integrator.setGlobalVariableByName("{kick}", kick)
-        integrator.setGlobalVariableByName("{moves}", moves)
-        integrator.step(count)
-
-
-platform = mm.Platform.getPlatformByName(sys.argv[1] if len(sys.argv) > 1 else "CPU")
-topology, state = app.PDBFile("{topology}").topology, load("{state}")
-trajectory = None
-with open("log.csv", "w") as log, open("trajectory.dcd", "wb") as frames:
-    lines = csv.writer(log, lineterminator="\\n")
-    lines.writerow(["stage", "step", "potential_kJ_mol", "kinetic_kJ_mol", "volume_A3"])
-    for name, steps, every, frame, file, others in STAGES:
-        system, integrator = load("{system}"), load(file)
-        for other in others:
-            system.addForce(load(other))
-        context = mm.Context(system, integrator, platform)
-        context.setPeriodicBoxVectors(*state.getPeriodicBoxVectors())
-        context.setPositions(state.getPositions())
-        context.setVelocities(state.getVelocities())
-        trajectory = trajectory or app.DCDFile(frames, topology, integrator.getStepSize())
-        done = 0
-        while done < steps:
-            more = min(steps, (done // every + 1) * every, (done // frame + 1) * frame) - done
-            advance(integrator, more)
-            done += more
-            groups = integrator.getIntegrationForceGroups()
-            state = context.getState(positions=True, velocities=True, energy=True, groups=groups)
-            if done % every == 0:
-                energies = [e._value for e in (state.getPotentialEnergy(), state.getKineticEnergy())]
-                volume = state.getPeriodicBoxVolume()._value * 1e3
-                lines.writerow([name, done, *energies, volume])
-                log.flush()
-            if done % frame == 0:
-                trajectory.writeModel(state.getPositions(), periodicBoxVectors=state.getPeriodicBoxVectors())
-with open("final.xml", "w") as file:
-    file.write(mm.XmlSerializer.serialize(state))
-'''
+#: The script, with names in braces for which `write_openmm` has values.
+TEXT = Path(__file__).with_name("run.txt").read_text(encoding="utf-8")
 
 
 def write_openmm(folder: Path, view: ForceFieldView, state: State) -> list[str]:
