@@ -460,11 +460,10 @@ def test_waves_of_a_cell_that_a_file_describes_otherwise(tmp_path):
     data = {
         "structure": {"file": "salt.xyz"},
         "molecules": ions,
-        "forces": {"electrostatics": "ewald", "ewald_alpha_per_A": 0.4, "ewald_k_max": [4, 2, 3]},
+        "forces": {"cutoff_A": 6.0, "electrostatics": "ewald", "ewald_alpha_per_A": 0.4, "ewald_k_max": [4, 2, 3]},
         "start": {"temperature_K": 100.0},
         "stages": [{"duration_ps": 1.0}],
     }
-    data["forces"] |= {"cutoff_A": 6.0, "truncation": "plain"}
     system = build(Scene.from_dict(data, tmp_path))
     assert cell_of(system.space) == pytest.approx(14.0 * np.eye(3))
     assert any("rotated, contents included" in note for note in system.notes)
@@ -871,7 +870,7 @@ count = 8
 [forces]
 cutoff_A = 6
 electrostatics = "reaction_field"
-truncation = "{truncation}"
+truncation = "shift"
 reaction_field_truncation = "{truncation}"
 tail_correction = false
 [start]
