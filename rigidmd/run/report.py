@@ -134,11 +134,10 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     if stage["moves_tried"]:
         accepted = stage["moves_accepted"] / stage["moves_tried"]
         rows.append(("box moves", f"{stage['moves_tried']}, {100 * accepted:.0f} % accepted"))
-    if stage["trajectories"]:
-        accepted, error = 100 * (stage["acceptance_mean"] or 0.0), 100 * (stage["acceptance_error_mean"] or 0.0)
-        size, weight = stage["abs_dH_kT_mean"] or 0.0, stage["exp_minus_dH_mean"]
-        rows.append(("trajectories", f"{stage['trajectories']}, {format_with_error(accepted, error)} % accepted"))
-        balance = _with_error(weight, stage["exp_minus_dH_error_mean"], 3)
+    if stage["trajectories"] and stage["acceptance_mean"] is not None:
+        accepted, size = 100 * stage["acceptance_mean"], stage["abs_dH_kT_mean"]
+        rows.append(("trajectories", f"{stage['trajectories']}, {accepted:.0f} % accepted"))
+        balance = _with_error(stage["exp_minus_dH_mean"], stage["exp_minus_dH_error_mean"], 3)
         rows.append(("", f"mean abs(dH) {size:.2g} kT; mean exp(-dH/kT) {balance}, 1 in equilibrium"))
     elif stage["drift_kJ_mol_ns_per_molecule"] is not None:
         what = "energy" if stage["ensemble"] == "nve" else "conserved energy"

@@ -299,7 +299,8 @@ def _means(samples: Samples, columns: Mapping[str, str]) -> dict[str, float | No
     """Means of columns, and their errors; the columns have the units of their keys."""
     found = {}
     for name, unit in columns.items():
-        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(samples[name])
+        values = samples[name]  # no trajectory has ended at the first sample
+        found[f"{name}_{unit}"], found[f"{name}_error_{unit}"] = mean_and_error(values[np.isfinite(values)])
     return found
 
 
