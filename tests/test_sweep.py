@@ -290,7 +290,8 @@ def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
 STEP = "stages.0.timestep_fs"
 
 
-def test_averages_at_a_step_of_zero(argon, tmp_path, capsys):
+def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rigidmd.studies.sweep.limits.MOST_PANELS", 2)  # drawing takes most of the time
     folder = tmp_path / "steps"
     swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
     fixed = ["--set", "stages.0.duration_ps=2", "--set", "output.log_interval_ps=0.02", "-o", str(folder)]
@@ -299,7 +300,8 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys):
         there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
         for point in there.manifest.points:
             Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
-    assert cli.main(["analyse", str(folder), "--only", "rdf"]) == 0
+    assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
+    assert re.search(r"first peak \(Å\) .*\d ± \d", capsys.readouterr().out)
     assert cli.main(["sweep", str(argon), *swept, *fixed, "--extrapolate", STEP]) == 0
     said = capsys.readouterr().out
     assert "averages at a step of 0, from errors of order dt² (velocity_verlet) in stages.0.timestep_fs" in said

@@ -150,7 +150,7 @@ def with_precision(
         k: error_of_step(species, found or temperature, stage.scheme, stage.timestep_fs)
         for k, stage, found in _given_steps(scene)
     }
-    seeks = [k for k, stage in enumerate(scene.stages) if stage.is_auto and stage.bias_kT is None]
+    seeks = [k for k, stage in enumerate(scene.stages) if stage.is_auto and not (stage.bias_kT or stage.is_hybrid)]
     precision, why = "double", "no stage has a given time step"
     if scene.engine.is_external:
         why = f"{scene.engine.title} computes the forces of the run"

@@ -156,6 +156,8 @@ class CpuEngine(Engine):
             box = self._box_workspace = self._box_workspace or barostat_workspace(state)
         if integrator.trajectory_steps:
             trajectory = self._trajectory = self._trajectory or trajectory_workspace(state)
+        elif self._trajectory is not None:
+            self._trajectory.known[0] = 0  # another integrator moves the state
         flows = integrator.thermostat or NoThermostat(), integrator.barostat or NoBarostat(), flow_arrays(integrator)
         return *flows, probe, self._heat, box, trajectory
 
