@@ -251,7 +251,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
     for changes, expected in (
         ([*GRID, "--set", "forces.cutoff_A=7.5"], "forces.cutoff_A is 7.5, there 8.0"),
         (GRID[:2], "it varies start.temperature_K and seed, not start.temperature_K"),
-        ([*GRID, "--set", "stages.0.duration_ps=2"], "stages.0.duration_ps is 1.0, there 0.5"),
+        ([*GRID, "--set", "stages.0.duration_ps=2"], "stages.0.duration_ps is 2.0, there 0.5"),
     ):
         assert cli.main(["sweep", str(argon), *changes, "-o", str(copied)]) == 2
         said = capsys.readouterr().err

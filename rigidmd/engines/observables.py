@@ -8,7 +8,7 @@ import numpy as np
 from rigidmd.core.state import HEAT, NOW, WORK, Load, State, edges_and_angles
 from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import OF_TRAJECTORIES, Sample
+from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.forces.ewald.interactions import NEUTRAL
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -60,7 +60,7 @@ class Observation(NamedTuple):
 def observe(
     system: System, engine: Engine, state: State, stage: int | None = None, *, time: float | None = None,
     origin: float | None = None, verlet_step: float = nan, moved: bool = False, energy_unit: float = KJ_PER_MOL,
-    trajectories: tuple[float, float, float] = (nan, nan, nan),
+    trajectories: tuple[float, ...] = (),
 ) -> Observation:  # fmt: skip
     """All observables, from one evaluation of forces and energies. This function fills the columns of the log.
 
@@ -71,7 +71,7 @@ def observe(
     (docs/theory/errors.md)
     moved : whether the engine has just moved this state, so that it may have its forces and energies already
     energy_unit : unit of all energies, u Å²/ps²
-    trajectories : the columns `OF_TRAJECTORIES`
+    trajectories : the columns `OF_TRAJECTORIES`, if the scene has them
 
     The pressure is the molecular one, (sum m V V + sum F R)/V over centres of mass (Allen & Tildesley 2017, 2.7.2). Its
     tensor is the symmetric part. The rest is the rate at which orientations gain angular momentum, 0 on average.
@@ -111,8 +111,8 @@ def observe(
         momentum=hypot(*sums.momentum.tolist()), orthogonality_error=sums.orthogonality_error, a=a, b=b, c=c,
         alpha=alpha, beta=beta, gamma=gamma, heat=float(ledger[HEAT]), work=float(ledger[WORK]), pressure_xx=xx,
         pressure_yy=yy, pressure_zz=zz, pressure_xy=xy, pressure_xz=xz, pressure_yz=yz, conserved=conserved,
-        **dict(zip(OF_TRAJECTORIES, trajectories, strict=True)), stage=stage or 0,
-        user_energies=tuple(components[name] / energy_unit for name in system.user_terms),
+        stage=stage or 0,
+        user_energies=(*(components[name] / energy_unit for name in system.user_terms), *trajectories),
     )  # fmt: skip
     return Observation(
         sample, {name: energy / energy_unit for name, energy in components.items()}, translation / energy_unit,

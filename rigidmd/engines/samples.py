@@ -24,7 +24,6 @@ class Column(NamedTuple):
     about: str
 
 
-TRAJECTORIES = "the trajectories of hybrid Monte Carlo since the line before"
 UNBIASED = "without the error of the step (velocity Verlet only)"
 
 
@@ -62,12 +61,9 @@ class Sample(NamedTuple):
     pressure_xy: Annotated[float, Column("Pressure xy (bar)", "bar", "the same, xy")]
     pressure_xz: Annotated[float, Column("Pressure xz (bar)", "bar", "the same, xz")]
     pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
-    acceptance: Annotated[float, Column("Acceptance", "1", f"fraction of {TRAJECTORIES} that were accepted")]
-    abs_dH_kT: Annotated[float, Column("abs(dH) (kT)", "kT", f"mean size of the error of the energy of {TRAJECTORIES}")]
-    exp_minus_dH: Annotated[float, Column("exp(-dH/kT)", "1", f"mean over {TRAJECTORIES}; in equilibrium 1 on average")]
     conserved: Annotated[float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol
+    user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol; then OF_TRAJECTORIES
 
 
 _HINTS = get_type_hints(Sample, include_extras=True)
@@ -80,12 +76,22 @@ NOT_AVERAGED = {
 }  # fmt: skip
 
 
-def user_columns(user_terms: Sequence[str]) -> dict[str, Column]:
-    return {name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}") for name in user_terms}
+_ENDED = "the trajectories of hybrid Monte Carlo since the line before"
+#: Columns that only scenes with hybrid Monte Carlo have.
+OF_TRAJECTORIES = {
+    "acceptance": Column("Acceptance", "1", f"fraction of {_ENDED} that was accepted"),
+    "abs_dH_kT": Column("abs(dH) (kT)", "kT", f"mean size of the change of the energy in {_ENDED}"),
+    "exp_minus_dH": Column("exp(-dH/kT)", "1", f"mean over {_ENDED}; in equilibrium 1 on average"),
+}
+IN_LOGS = COLUMNS | OF_TRAJECTORIES
 
 
-#: Columns that only scenes with hybrid Monte Carlo write.
-OF_TRAJECTORIES = ("acceptance", "abs_dH_kT", "exp_minus_dH")
+def more_columns(names: Sequence[str]) -> dict[str, Column]:
+    """The columns of a scene's own forces and of its trajectories."""
+    energy = lambda name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")  # noqa: E731
+    return {name: OF_TRAJECTORIES.get(name) or energy(name) for name in names}
+
+
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]
 
 
@@ -152,13 +158,13 @@ class Samples(SampleTable):
     """The samples of a run in order: a table with one row of float64 per sample.
 
     stages : names of all stages
-    user_terms : names of user-defined forces, whose energies are columns
+    user_terms : names of user-defined forces, whose energies are columns, and of OF_TRAJECTORIES
     table : the result of an earlier `table()`. Raises ValueError if it is invalid.
     """
 
     def __init__(self, stages: Sequence[str], user_terms: tuple[str, ...] = (), table: np.ndarray | None = None):
         self.stages, self.user_terms = tuple(stages), user_terms
-        self.described = COLUMNS | user_columns(user_terms)
+        self.described = COLUMNS | more_columns(user_terms)
         self._numbers = [*NUMBERS, *user_terms]
         self._values = array("d")  # grows in place
         if table is not None:

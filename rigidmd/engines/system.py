@@ -12,6 +12,7 @@ from rigidmd.core.state import State
 from rigidmd.core.state_file import SavedState
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
+from rigidmd.engines.samples import OF_TRAJECTORIES
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
 from rigidmd.scene import MolecularScene
@@ -103,6 +104,12 @@ class System:
         """Names of the terms whose energy depends on positions in the lab, which exclude a barostat. A field is among
         them only if a molecule has a net charge."""
         return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
+
+    @property
+    def more_columns(self) -> tuple[str, ...]:
+        """The columns of this scene that not all scenes have."""
+        hybrid = any(stage.is_hybrid for stage in self.scene.stages)
+        return *self.user_terms, *(OF_TRAJECTORIES if hybrid else ())
 
     @property
     def removes_momentum_every(self) -> float | None:

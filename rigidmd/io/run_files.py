@@ -153,26 +153,22 @@ DELAY, SELDOM = 0.5, 0.05
 TENSOR = tuple(name for name in samples.COLUMNS if name.startswith("pressure_") and len(name) == len("pressure_xx"))
 
 
-def columns(tensor: bool = True, user_terms: Sequence[str] = (), trajectories: bool = True) -> dict[str, str]:
-    """Name of each column -> its header, with or without the pressure tensor and the acceptance of trajectories, and
-    with user-defined forces."""
-    described = samples.COLUMNS | samples.user_columns(user_terms)
-    omitted = (*(() if tensor else TENSOR), *(() if trajectories else samples.OF_TRAJECTORIES))
-    return {name: column.header for name, column in described.items() if column.header and name not in omitted}
+def columns(tensor: bool = True, user_terms: Sequence[str] = ()) -> dict[str, str]:
+    """Name of each column -> its header, with or without the pressure tensor. user_terms : see `Samples`"""
+    described = samples.COLUMNS | samples.more_columns(user_terms)
+    written = {name: column.header for name, column in described.items() if column.header}
+    return written if tensor else {name: header for name, header in written.items() if name not in TENSOR}
 
 
 class Log(AppendedFile):
     """Writes samples to log.csv, numbers with all significant digits, missing values empty. Raises OutputError.
 
     kept : earlier value of the property `kept`, from which the file is continued; None begins a new file
-    tensor, user_terms, trajectories : see `columns`
+    tensor, user_terms : see `columns`
     """
 
-    def __init__(
-        self, path: Path, tensor: bool, kept: Sequence[int] | None = None, user_terms: Sequence[str] = (),
-        trajectories: bool = False,
-    ):  # fmt: skip
-        self._columns = columns(tensor, user_terms, trajectories)
+    def __init__(self, path: Path, tensor: bool, kept: Sequence[int] | None = None, user_terms: Sequence[str] = ()):
+        self._columns = columns(tensor, user_terms)
         shared = [name for name in self._columns if name not in user_terms]
         self._values = attrgetter(*shared)
         self._time = shared.index("time")

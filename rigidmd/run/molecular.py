@@ -20,7 +20,7 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import COLUMNS, Samples
+from rigidmd.engines.samples import IN_LOGS, OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError
 from rigidmd.io.checkpoint import Checkpoint
@@ -81,7 +81,7 @@ class MolecularRun(RunPart):
         super().__init__(simulation)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         self._start = build(scene.with_user_code(() if forces is None else given, thermostat))
-        if clash := [name for name in self._start.user_terms if name in COLUMNS]:
+        if clash := [name for name in self._start.user_terms if name in IN_LOGS]:
             errors = [f"{name} is a column of the log; name the force otherwise" for name in clash]
             raise SceneError(scene.source, errors)
         self.reset()
@@ -333,7 +333,7 @@ class MolecularRun(RunPart):
         is_verlet = stage.integrator == "velocity_verlet" and not (stage.is_minimisation or stage.is_hybrid)
         # an external engine may not report the heat of its thermostat
         conserves = not stage.is_minimisation and self.engine.conserves_energy
-        trajectories = (nan, nan, nan)
+        trajectories = tuple(nan for name in self.system.more_columns if name in OF_TRAJECTORIES)
         if (sums := self.engine.trajectories) is not None:
             samples = self._sampler.samples
             of_stage = len(samples) > 0 and samples.row(-1).stage == moment.stage

@@ -1,7 +1,7 @@
 """Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state, energy.png."""
 
 from math import inf
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,8 +34,7 @@ class LogFile(GrowingFile):
         self.interval, self._tensor = interval, tensor
 
     def begin(self, run: "Simulation") -> None:
-        hybrid = any(stage.is_hybrid for stage in run.scene.stages)
-        self._file = Log(run.path(LOG), self._tensor, self.kept, tuple(run.system.user_terms), hybrid)
+        self._file = Log(run.path(LOG), self._tensor, self.kept, run.system.more_columns)
 
     def see(self, moment: Moment) -> None:
         self._file.write(moment.sample)
@@ -83,16 +82,18 @@ def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, sta
 class Sampler(Observer):
     """Keeps samples, checks each against the limits of the scene, and keeps the last state that passed."""
 
-    remembers: ClassVar[dict[str, Any]] = {"table": np.ndarray, "trajectories": np.ndarray}
+    remembers: dict[str, Any] = {"table": np.ndarray}  # noqa: RUF012
     ends = reads_energies = True
     _names = (LAST_GOOD,)
 
     def __init__(self, run: "Simulation", interval: float, check: checks.StepCheck):
         self.interval = interval
-        self.samples = Samples([stage.label for stage in run.scene.stages], tuple(run.system.user_terms))
+        self.samples = Samples([stage.label for stage in run.scene.stages], run.system.more_columns)
         self.last_good: State | None = None
         self._run, self._check = run, check
         self.trajectories = np.zeros(5)  # see `Engine.trajectories`, at the last sample
+        if any(stage.is_hybrid for stage in run.scene.stages):
+            self.remembers = self.remembers | {"trajectories": np.ndarray}
         self._begins: dict[int, int] = {}  # stage -> row of the last sample before it, or of the first
 
     def origin(self, stage: int) -> float | None:

@@ -24,7 +24,7 @@ from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.scene.stage import Stage
 
 #: Name of a column -> its header in log.csv, and back.
-HEADERS = {column.header: name for name, column in samples.COLUMNS.items() if column.header}
+HEADERS = {column.header: name for name, column in samples.IN_LOGS.items() if column.header}
 BODY_HEADERS = {column.header: name for name, column in BODY_COLUMNS.items()}
 
 

@@ -256,9 +256,7 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
         **temperatures, "potential_kJ_mol_per_molecule": potential[0],
         "potential_error_kJ_mol_per_molecule": potential[1],
         "pressure_bar": pressure[0], "pressure_error_bar": pressure[1],
-        **(_means(steady, BOX) if stage.has_barostat else {}), **(_means(steady, HYBRID) if stage.is_hybrid else {}),
-        "trajectories": steps // stage.steps_together if stage.is_hybrid else None,
-        "moves_tried": moves[0], "moves_accepted": moves[1],
+        **(_means(steady, BOX) if stage.has_barostat else {}), "moves_tried": moves[0], "moves_accepted": moves[1],
         "drift_verdict": _drift_verdict(line.value, line.error, _drift_limit(duration) * thermal) if duration else None,
         "drift_kJ_mol_ns_per_molecule": _finite_or_none(line.value * 1000 / n),
         "drift_error_kJ_mol_ns_per_molecule": _finite_or_none(line.error * 1000 / n),
@@ -270,6 +268,8 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     if stage.ensemble == "nve" and earlier.has_thermostat and len(steady) >= MIN_SAMPLES:
         values["temperature_before_K"] = earlier.temperatures[1]
         values["temperature_scatter_K"] = _temperature_scatter(steady["temperature"], system.freedom_in(k).total)
+    if stage.is_hybrid:
+        values |= {"trajectories": steps // stage.steps_together} | _means(steady, HYBRID)
     if stage.volume:
         values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {"volume_before_nm3": first.volume}
     return values

@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
-from rigidmd.engines.samples import BODY_COLUMNS, COLUMNS, NOT_AVERAGED
+from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
 from rigidmd.io.write import Column, nine_digits, with_error
@@ -153,7 +153,7 @@ def summarise_run(record: Record) -> dict[str, Measured]:
             continue
         if np.ptp(values[production]) == 0:
             average, error = float(values[production][0]), 0.0
-        found[COLUMNS[name].header] = average, error
+        found[IN_LOGS[name].header] = average, error
         if name == "potential":
             n = len(record.molecules.model.species)
             found[POTENTIAL] = average / n, None if error is None else error / n
