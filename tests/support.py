@@ -464,6 +464,7 @@ MODULES = {
     "resistance": "forces.body.resistance",
     "sampling": "studies.accuracy.averages",
     "stable_step": "run.pilot.stable_step",
+    "limits": "studies.sweep.limits",
     "sweeping": "studies.sweep.sweeping",
     "reading_process": "io.formats.through_mdanalysis",
     "watch": "run.checks",

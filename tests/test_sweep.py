@@ -28,6 +28,7 @@ from support import (
     code_kind,
     format_ranges,
     format_walltime,
+    limits,
     over_replicas,
     parse_axis,
     point_name,
@@ -291,7 +292,7 @@ STEP = "stages.0.timestep_fs"
 
 
 def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rigidmd.studies.sweep.limits.MOST_PANELS", 2)  # drawing takes most of the time
+    monkeypatch.setattr(limits, "MOST_PANELS", 2)  # drawing takes most of the time
     folder = tmp_path / "steps"
     swept = ["--set", f"{STEP}=5,10,20", "--set", "start.temperature_K=90,120"]
     fixed = ["--set", "stages.0.duration_ps=2", "--set", "output.log_interval_ps=0.02", "-o", str(folder)]

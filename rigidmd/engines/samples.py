@@ -87,7 +87,7 @@ IN_LOGS = COLUMNS | OF_TRAJECTORIES
 
 
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of a scene's own forces and of its trajectories."""
+    """The columns of user-defined forces and of the trajectories of hybrid Monte Carlo."""
     energy = lambda name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")  # noqa: E731
     return {name: OF_TRAJECTORIES.get(name) or energy(name) for name in names}
 
