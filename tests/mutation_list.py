@@ -299,4 +299,18 @@ RINGS = [
         "    x, y, z = map(float, system.model.keeps_momentum | system.keeps_momentum_in(k))",
         ("test_wiring.py::test_cell_rescaling_knows_whether_the_total_momentum_is_kept",),
     ),
+    Mutation(
+        "R-hmc-1", "hybrid Monte Carlo: the sign of the change of the energy in the test",
+        "dynamics/hybrid_monte_carlo.py",
+        "    if log(u) < -loss:",
+        "    if log(u) < loss:",
+        ("test_ensembles.py::test_dipoles_at_a_long_step_by_hybrid_monte_carlo[350.0-0.0008]",),
+    ),
+    Mutation(
+        "R-hmc-2", "hybrid Monte Carlo: a barostat takes the virial of a trajectory that was rejected",
+        "dynamics/hybrid_monte_carlo.py",
+        "            barostat_workspace.known[0] = 0",
+        "            barostat_workspace.known[0] = 1",
+        ("test_hybrid_monte_carlo.py::test_energy_less_heat_and_work_is_conserved[pressed1]",),
+    ),
 ]  # fmt: skip
