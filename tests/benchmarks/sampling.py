@@ -78,7 +78,7 @@ class Method(NamedTuple):
     motion: bool = True  # whether it keeps the motion that D belongs to
 
 
-RESCALING, LANGEVIN = {"thermostat": "velocity_rescaling"}, {"thermostat": "langevin"}
+RESCALING, LANGEVIN, HYBRID = ({"thermostat": t} for t in ("velocity_rescaling", "langevin", "hybrid_monte_carlo"))
 METHODS = {
     "velocity_verlet + velocity_rescaling": Method(
         "rigidmd", "#2b7fb8", (1, 2, 4, 6, 8), (2, 4), RESCALING | {"integrator": "velocity_verlet"}),
@@ -88,6 +88,10 @@ METHODS = {
         "rigidmd", "#123d5c", (2, 4, 8), (4, 8), RESCALING | {"integrator": "baoab"}),
     "baoab + langevin": Method("rigidmd", "#b8862d", (2, 4, 8), (4, 8), LANGEVIN | {"integrator": "baoab"}, False),
     "srkn_4 + velocity_rescaling": Method("rigidmd", "#7a5ca3", (8,), (), RESCALING | {"integrator": "srkn_4"}),
+    "velocity_verlet + hybrid_monte_carlo": Method(
+        "rigidmd", "#5aa79b", (2, 4), (), HYBRID | {"integrator": "velocity_verlet"}, False),
+    "two_stage + hybrid_monte_carlo": Method(
+        "rigidmd", "#1f6f63", (4, 8), (4,), HYBRID | {"integrator": "two_stage"}, False),
     "GROMACS md + v-rescale": Method(
         "gromacs", "#c8553d", (1, 2, 4, 8), (2, 4),
         {"integrator": "md", "tcoupl": "v-rescale", "tc-grps": "system", "tau-t": 0.1, "ref-t": TEMPERATURE}),
@@ -166,6 +170,8 @@ def run_rigidmd(run: Run, folder: Path, start: Path) -> tuple:
         frames.append(np.array(moment.site_positions[::3]))
 
     stage = METHODS[run.method].options | {"ensemble": run.ensemble, "timestep_fs": run.step}
+    if stage["thermostat"] == "hybrid_monte_carlo":
+        stage |= {"trajectory_steps": round(1000 * EVERY / run.step)}
     stage |= {"duration_ps": FRAMES * EVERY} | ({"pressure_bar": 1.0} if run.ensemble == "npt" else {})
     simulation = simulate(scene(stage, 1 + run.round), start, observers=Every(EVERY, look))
     results = simulation.run(progress=False)
