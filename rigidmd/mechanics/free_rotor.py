@@ -274,6 +274,26 @@ def rotate_by_vector(rotation, x, y, z):
     rotate_rows(rotation, x, y, z, -odd, even)
 
 
+@kernel
+def restore_orthogonality(rotation, momentum):
+    """Q <- Q (3 - QᵀQ) / 2 of rotations (n, 3, 3), in place: a Newton step to the nearest rotation (Higham 2008, Functions
+    of Matrices, eq. 8.20), which leaves the square of the error. Bodies without angular momentum (n, 3) are left out."""
+    for m in range(len(rotation)):
+        if momentum[m, 0] == 0.0 and momentum[m, 1] == 0.0 and momentum[m, 2] == 0.0:
+            continue
+        q = rotation[m]
+        xx, yy, zz = -1.0, -1.0, -1.0
+        xy = yz = zx = 0.0
+        for i in range(3):
+            xx, yy, zz = xx + q[i, 0] * q[i, 0], yy + q[i, 1] * q[i, 1], zz + q[i, 2] * q[i, 2]
+            xy, yz, zx = xy + q[i, 0] * q[i, 1], yz + q[i, 1] * q[i, 2], zx + q[i, 2] * q[i, 0]
+        for i in range(3):
+            x, y, z = q[i, 0], q[i, 1], q[i, 2]
+            q[i, 0] = x - 0.5 * (x * xx + y * xy + z * zx)
+            q[i, 1] = y - 0.5 * (x * xy + y * yy + z * yz)
+            q[i, 2] = z - 0.5 * (x * zx + y * yz + z * zz)
+
+
 @chosen_by_type(inline=True)
 def rotate_body(rotor, state, time, h):
     """Rotate a single body freely from `time` to time + h, in place."""
