@@ -111,7 +111,7 @@ def test_frozen_molecules_do_not_count_and_do_not_move(slit):
     assert system.freedom == (60, 60)
     state = system.state.copy()
     engine.forget()
-    move(engine, state, VERLET, 0.0002, 100)
+    move(engine, state, VERLET, 0.0001, 300)
     assert (state.position[20:] == system.state.position[20:]).all()
     assert (state.rotation[20:] == system.state.rotation[20:]).all()
     assert not state.velocity[20:].any()

@@ -276,8 +276,8 @@ def rotate_by_vector(rotation, x, y, z):
 
 @kernel
 def restore_orthogonality(rotation, momentum):
-    """Q <- Q (3 - QᵀQ) / 2 of rotations (n, 3, 3), in place: a Newton step to the nearest rotation (Higham 2008, Functions
-    of Matrices, eq. 8.20), which leaves the square of the error. Bodies without angular momentum (n, 3) are left out."""
+    """Q <- Q (3 - QᵀQ) / 2 of rotations (n, 3, 3), in place: a Newton step to the nearest rotation, which leaves the
+    square of the error (Higham 2008, Functions of Matrices, eq. 8.20). Bodies without angular momentum (n, 3) stay."""
     for m in range(len(rotation)):
         if momentum[m, 0] == 0.0 and momentum[m, 1] == 0.0 and momentum[m, 2] == 0.0:
             continue

@@ -28,11 +28,11 @@ CASES = {
     "top_split": ("free top, split rotor", "free_asymmetric_top", {}, "velocity_verlet", "split", 0.1, 10**8),
     "heavy_top": ("heavy top, srkn_6", "heavy_top_3", {}, "srkn_6", "exact", 0.002, 10**8),
     "dimer_double": ("two waters, velocity_verlet, double", "water_dimer", {"precision": "double"},
-                     "velocity_verlet", "exact", 0.5, 5 * 10**7),
+                     "velocity_verlet", "exact", 0.5, 10**8),
     "dimer_mixed": ("two waters, velocity_verlet, mixed", "water_dimer", {"precision": "mixed"},
-                    "velocity_verlet", "exact", 0.5, 5 * 10**7),
-    "dimer_6_double": ("two waters, srkn_6, double", "water_dimer", {"precision": "double"}, "srkn_6", "exact", 0.5, 10**6),
-    "dimer_6_mixed": ("two waters, srkn_6, mixed", "water_dimer", {"precision": "mixed"}, "srkn_6", "exact", 0.5, 10**6),
+                    "velocity_verlet", "exact", 0.5, 10**8),
+    "dimer_6_double": ("two waters, srkn_6, double", "water_dimer", {"precision": "double"}, "srkn_6", "exact", 0.5, 10**7),
+    "dimer_6_mixed": ("two waters, srkn_6, mixed", "water_dimer", {"precision": "mixed"}, "srkn_6", "exact", 0.5, 10**7),
 }  # fmt: skip
 QUANTITIES = {
     "L": "angular momentum, relative",
