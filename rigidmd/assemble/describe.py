@@ -126,14 +126,11 @@ def _describe_molecules(system: System) -> str:
     lines.append(f"\nmemory: about {bytes_of(system) / 1e6:.1f} MB for state, forces, neighbour lists and samples")
     if not scene.engine.is_external:
         threads = usable_threads(scene.threads)
-        how = describe_precision(system) if system.precision_reason else PRECISIONS[scene.precision]
+        how = PRECISIONS[scene.precision]
+        if system.precision_reason:
+            how = f"{scene.precision} precision, chosen because {system.precision_reason}"
         lines.append(f"computing: {threads} thread{'s' * (threads > 1)}, {how}")
     return "\n".join(lines)
-
-
-def describe_precision(system: System) -> str:
-    """The precision of forces that "auto" has chosen, and why."""
-    return f"{system.scene.precision} precision, chosen because {system.precision_reason}"
 
 
 def _words(part: NamedTuple) -> str:

@@ -17,7 +17,7 @@ from rigidmd.scene.models import (
     Molecule, MoleculeFile, Site, find_site, load_model, molecule, read_molecule, read_parameters, with_masses,
     with_parameters,
 )  # fmt: skip
-from rigidmd.scene.species import Molecules
+from rigidmd.scene.species import Molecules, spans
 from rigidmd.scene.validation import ValidationError, not_none, validation_messages
 
 
@@ -86,7 +86,8 @@ def split_frozen(
     for k, entry in enumerate(scene.molecules):
         of_species = index == k
         selected = np.zeros(len(index), bool)
-        for _, mask, fault in select_by_number(entry.frozen_spans, species[k].name, of_species, number):
+        ranges = [] if isinstance(entry.frozen, bool) else spans(entry.frozen)
+        for _, mask, fault in select_by_number(ranges, species[k].name, of_species, number):
             faults += [f"molecules.{k}.frozen: {fault}"] if fault else []
             selected |= mask
         if selected.any() and (selected == of_species).all():

@@ -34,8 +34,7 @@ def write_state(path: Path, saved: SavedState) -> None:
     more = {name: array for name, array in more.items() if array is not None}
     with atomic_file(path) as temporary:
         arrays: dict[str, Any] = dict(zip(STORED_NAMES, saved.state, strict=True))
-        names = np.array(saved.names)
-        np.savez(temporary, schema=SCHEMA, species_names=names, species=saved.species, **more, **arrays)
+        np.savez(temporary, schema=SCHEMA, species_names=np.array(saved.names), species=saved.species, **more, **arrays)
 
 
 def read_state(path: Path) -> SavedState:
@@ -59,8 +58,7 @@ def read_state(path: Path) -> SavedState:
         raise StructureError(str(path), [reason])
     example = state_of()
     if schema == 1:
-        known = ("species", "residue_number", *STORED_NAMES[:5])
-        arrays = {key: arrays[key] for key in known if key in arrays}
+        arrays = {key: arrays[key] for key in ("species", "residue_number", *STORED_NAMES[:5]) if key in arrays}
         arrays |= dict(zip(STORED_NAMES[5:], example[5:], strict=True))
     if missing := [key for key in STORED_NAMES if key not in arrays]:
         raise StructureError(str(path), [f"is not a state that rigidmd wrote: it holds no {', '.join(missing)}"])

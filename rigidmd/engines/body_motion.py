@@ -59,16 +59,14 @@ def motion(system: BodySystem, snapshots: list[Snapshot]) -> Motion:
         columns |= _columns("euler_angles", to_euler_angles(rotation))
         if isinstance(system.body.rotor, DrivenRotor):
             columns |= _columns("h_body", system.moments(times)[1] @ system.axes.T)
-        momentum = states.angular_momentum_body.reshape(-1, 3) @ system.axes.T
-        for name, body in (("omega", omega), ("L", momentum)):
+        for name, body in (("omega", omega), ("L", states.angular_momentum_body.reshape(-1, 3) @ system.axes.T)):
             columns |= _columns(f"{name}_body", body)
             columns |= _columns(f"{name}_lab", np.einsum("tij,tj->ti", rotation, body))
     columns |= energies(system, times, states)
     errors = _errors(system, columns)
     columns |= {f"{name}_error": error for name, error in errors.items()}
     if system.rotates:
-        gap = np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)
-        columns["orthogonality_error"] = np.abs(gap).max(axis=(1, 2))
+        columns["orthogonality_error"] = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(1, 2))
     return Motion(columns, list(errors))
 
 
@@ -132,8 +130,7 @@ def _errors(system: BodySystem, columns: dict[str, np.ndarray]) -> dict[str, np.
     arms = [term.point for term in forces if term.force.any()]
     if lossless and not driven and inertial and not isinstance(body.translation, FluidTranslation):
         if not any(arm.any() for arm in arms):
-            gap = np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values()))
-            errors["L_lab"] = _relative(gap, size.max())
+            errors["L_lab"] = _relative(np.sqrt(sum((part - part[0]) ** 2 for part in momentum.values())), size.max())
             errors["L_size"] = _relative(size - size[0], size.max())
         else:
             pulling = [np.flatnonzero(term.force) for term in forces if term.point.any() and term.force.any()]

@@ -55,8 +55,7 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     radius = max(m.radius for m in system.species)
     for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):
         if len(a := ours.load[k]):
-            loads = (a, theirs.load[k], theirs.load[k] - a)
-            rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in loads]
+            rms = [float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (a, theirs.load[k], theirs.load[k] - a)]
             # the tolerance is relative to the rms, or to the energy of a body where it nearly vanishes
             scale = max(rms[0], size / len(system.model.species) / (system.smallest_diameter if k == 0 else 1.0))
             values = (x / KJ_PER_MOL for x in (*rms, plain * scale + tolerance))

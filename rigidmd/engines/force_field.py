@@ -92,8 +92,7 @@ class ForceFieldView(NamedTuple):
     @property
     def is_body(self) -> np.ndarray:
         """Whether each molecule (n,) is a rigid body that rotates. All others are points or frozen."""
-        rotates = np.array([m.inertia.any() for m in self.system.species])
-        return rotates[self.system.model.species] & ~self.frozen
+        return np.array([m.inertia.any() for m in self.system.species])[self.system.model.species] & ~self.frozen
 
 
 def force_field_of(system: System) -> ForceFieldView:

@@ -12,6 +12,7 @@ import numpy as np
 
 from rigidmd.core.state import Load, State
 from rigidmd.engines.system import System
+from rigidmd.mechanics.rotation import hat, nearest_rotation
 from rigidmd.scene.models import Molecule
 
 
@@ -88,16 +89,11 @@ class RigidBodies:
 
     def _rotations(self, before: np.ndarray, arm: np.ndarray) -> np.ndarray:
         """Rotations (n, 3, 3) that bring the body-frame offsets nearest to the offsets (s, 3) in the lab."""
-        overlap = np.zeros((self._count, 9))
         products = np.einsum("si,sj->sij", arm, self._body).reshape(-1, 9)
-        for k in range(9):
-            overlap[:, k] = np.bincount(self._molecule, products[:, k], self._count)
-        left, _, right = np.linalg.svd(overlap.reshape(-1, 3, 3))
-        left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-        found = left @ right
+        found = nearest_rotation(self._sum(products).reshape(-1, 3, 3))
         if (line := self._linear).any():
-            axis, axis_body = left[line, :, 0], right[line, 0]
-            found[line] = _tilted(before[line], np.einsum("nij,nj->ni", before[line], axis_body), axis)
+            axis_body = (self._inertia[line] == 0).astype(float)
+            found[line] = _tilted(before[line], *(np.einsum("nij,nj->ni", q[line], axis_body) for q in (before, found)))
         return found
 
 
@@ -113,13 +109,9 @@ def _tilted(rotation: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarra
     back = (np.einsum("ni,ni->n", old, new) < 0)[:, None]
     by_180 = np.where(back[:, None], 2 * np.einsum("ni,nj->nij", across, across) - np.eye(3), np.eye(3))
     old = np.where(back, -old, old)
-    cross, cosine = np.cross(old, new), np.einsum("ni,ni->n", old, new)
-    hat = np.zeros((len(old), 3, 3))
-    for (i, j), k in {(2, 1): 0, (0, 2): 1, (1, 0): 2}.items():
-        hat[:, i, j], hat[:, j, i] = cross[:, k], -cross[:, k]
-    step = np.eye(3) + hat + hat @ hat / (1 + cosine)[:, None, None]
-    left, _, right = np.linalg.svd(step @ by_180 @ rotation)
-    return left @ right
+    cross, cosine = hat(np.cross(old, new)), np.einsum("ni,ni->n", old, new)
+    step = np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
+    return nearest_rotation(step @ by_180 @ rotation)
 
 
 #: A molecule is planar if its second moment across a plane is below this fraction of the largest one.

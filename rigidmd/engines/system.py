@@ -108,8 +108,7 @@ class System:
     @property
     def more_columns(self) -> tuple[str, ...]:
         """The columns of this scene that not all scenes have."""
-        hybrid = any(stage.is_hybrid for stage in self.scene.stages)
-        return *self.user_terms, *(OF_TRAJECTORIES if hybrid else ())
+        return *self.user_terms, *(OF_TRAJECTORIES if any(stage.is_hybrid for stage in self.scene.stages) else ())
 
     @property
     def removes_momentum_every(self) -> float | None:

@@ -131,8 +131,7 @@ def _angles_figure(columns: dict[str, np.ndarray]):
     beyond_turn = [np.ptp(angle) > 360 for angle in angles]
     drawn = [angle / 360 if many else angle for angle, many in zip(angles, beyond_turn, strict=True)]
     labels = [f"{name} ({'turns' if many else '°'})" for name, many in zip("φθψ", beyond_turn, strict=True)]
-    cells = figure.add_gridspec(3, 1)
-    panels = _draw_series(figure, cells, time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
+    panels = _draw_series(figure, figure.add_gridspec(3, 1), time, drawn, labels, 1e-5, 1.0, (COOL, WARM, COOL))
     panels[1].set_title(_range(theta), **NOTE)
     for panel, angle in zip(panels[::2], angles[::2], strict=True):
         first, last = np.round(angle[[0, -1]], 6) + 0.0

@@ -41,8 +41,7 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     shown = moving(stages, samples["stage"])
     column = {name: samples[name][shown] for name in DRAWN}
     time, stage = column["time"], samples["stage"][shown]
-    last = stage == stage[-1]
-    known = bool(np.isfinite(column["drift"][last]).any())  # an external engine may not report it
+    known = bool(np.isfinite(column["drift"][stage == stage[-1]]).any())  # an external engine may not report it
     figure = new_figure(8, 7, title=f"{system.scene.name}: {n} molecules")
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes

@@ -74,13 +74,6 @@ def make_folder(folder: Path, names: Iterable[str], lock: "FolderLock") -> None:
         write_marker(folder, names)
 
 
-def continue_folder(folder: Path, names: Iterable[str]) -> None:
-    """Resume in the folder of a run that will also write these files; removes its old summary. Raises OutputError."""
-    add_to_folder(folder, names)
-    with writing(folder):
-        (folder / SUMMARY).unlink(missing_ok=True)
-
-
 def check_is_run(folder: Path) -> None:
     """Raise OutputError unless a run has written to a folder."""
     if not folder.is_dir():

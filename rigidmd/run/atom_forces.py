@@ -130,8 +130,7 @@ def ase_results(
     atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
     velocity, momentum = np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body)
-    at_rest = state._replace(velocity=velocity, angular_momentum_body=momentum)
-    seen = observe(system, engine, at_rest, energy_unit=EV)
+    seen = observe(system, engine, state._replace(velocity=velocity, angular_momentum_body=momentum), energy_unit=EV)
     load, torque = seen.load, np.zeros_like(seen.load.force)
     if len(state.rotation):
         torque = np.einsum("nij,nj->ni", state.rotation, load.torque_body)
@@ -152,8 +151,7 @@ def gradient_forces(
     molecules, lab frame; atoms : as in `ase_results`"""
     atom = system.sites.mass > 0
     of_atom, mass = system.sites.molecule[atom], system.sites.mass[atom, None]
-    total = system.model.mass[system.model.species][:, None]
-    found = mass * (force / total)[of_atom]
+    found = mass * (force / system.model.mass[system.model.species][:, None])[of_atom]
     if len(state.rotation):
         arm, r = _arms(system, state, atoms)
         y = arm[atom]

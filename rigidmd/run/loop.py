@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidmd.core.files import writing
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
 from rigidmd.engines.protocol import Halted, NotFiniteError
@@ -59,8 +60,7 @@ class RunLoop:
     def __init__(self, simulation: "Simulation", force: bool, resumes: bool, deadline: float | None):
         self._simulation, self._folder, self._part = simulation, simulation.folder, simulation.part
         self._force, self._resumes = force, resumes
-        minutes = simulation.scene.output.checkpoint_minutes
-        self.checkpoints = CheckpointSchedule(simulation.folder, minutes, deadline)
+        self.checkpoints = CheckpointSchedule(simulation.folder, simulation.scene.output.checkpoint_minutes, deadline)
         self.process = os.getpid()
         self.interrupted, self.out_of_time, self.advanced = False, False, 0
         self.signal: int | None = None
@@ -159,7 +159,9 @@ class RunLoop:
                     simulation.note(changed)
                 simulation.announce(f"continuing from step {part.state.step[NOW]}")
             if self._folder is not None and stays:
-                run_folder.continue_folder(self._folder, names)
+                run_folder.add_to_folder(self._folder, names)
+                with writing(self._folder):
+                    (self._folder / SUMMARY).unlink(missing_ok=True)
             elif self._folder is not None:
                 run_folder.make_folder(self._folder, names, lock)
             yield
@@ -172,8 +174,7 @@ class RunLoop:
                 yield from self._run_segments(kept is not None)
                 while self._until < inf and self.signal is None and self._error is None:
                     yield  # `run` or `close` completes the run
-                wall = self._wall + clock.perf_counter() - self._since
-                self._finish(preparing, wall)
+                self._finish(preparing, self._wall + clock.perf_counter() - self._since)
             except (SimulationError, OutputError) as error:
                 self._check_process()
                 raise self._failed(error) from None

@@ -127,8 +127,7 @@ class MolecularRun(RunPart):
     def _set_stages(self, stages: Iterable[Stage]) -> None:
         """Set the stages of the run, some of which may have been chosen by pilot runs."""
         self.record.stages = tuple(stages)
-        scene = self._start.scene.model_copy(update={"stages": self.record.stages})
-        self.system = replace(self._start, scene=scene)
+        self.system = replace(self._start, scene=self._start.scene.model_copy(update={"stages": self.record.stages}))
         # the integrator of a stage with its thermostat and barostat, made once
         self._integrator = cache(partial(integrator_of_stage, self.system))
 
@@ -368,8 +367,7 @@ class MolecularRun(RunPart):
 
     def summary(self, samples: Samples, preparing: float, wall: float) -> dict[str, Any]:
         self.record.moves[self.record.position.segment] = self.engine.moves or (0, 0)
-        interrupted = self.simulation.is_interrupted
-        return summarise(self.system, self.record, samples, self.state, preparing, wall, interrupted)
+        return summarise(self.system, self.record, samples, self.state, preparing, wall, self.simulation.is_interrupted)
 
     def explain(self, error: SimulationError) -> str:
         stable = self.record.stable.get(self.record.position.segment)

@@ -121,10 +121,9 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
 
 def describe_changes(before: Mapping[str, Any]) -> str | None:
     """A sentence if the run so far was computed with other versions or on another processor; None otherwise."""
-    now = computed_with()
     changed = [
         f"{key.replace('_', ' ').removesuffix(' version')} {then} there, {here} here"
-        for key, (then, here) in differences(before, now, None).items()
+        for key, (then, here) in differences(before, computed_with(), None).items()
         if key not in ("python_version", "processor_features")
     ]
     if not changed:

@@ -57,39 +57,30 @@ class RigidFit:
 
 class _Template:
     """The sites of a molecule in its body frame, which extend in r dimensions. middle (3,) : mean of the sites; weights
-    (s, r), columns (r, 3) : of the singular value decomposition"""
+    (s, r) : of the singular value decomposition; axes (3, 3) : in rows, along its first two directions"""
 
     def __init__(self, molecule: Molecule):
         body = molecule.positions_body
         self.middle = body.mean(axis=0)
         left, sizes, columns = np.linalg.svd(body - self.middle, full_matrices=False)
         rank = int((sizes > FLAT * max(sizes[0], np.abs(body).max())).sum()) if sizes[0] > 0 else 0
-        self.weights, self.columns = left[:, :rank] / sizes[:rank], columns[:rank]
+        self.weights, self.axes = left[:, :rank] / sizes[:rank], _right_handed(columns[None, :rank])[0]
 
     def rotations_onto(self, arms: np.ndarray) -> np.ndarray:
         """Rotations (n, 3, 3) of the template onto sites (n, s, 3) about their middle."""
-        seen = np.einsum("nsi,sr->nri", arms, self.weights)
-        axes = np.empty((len(arms), 3, 3))  # rows: directions of the template's axes
-        rank = len(self.columns)
-        axes[:, 0] = seen[:, 0] if rank else [1.0, 0.0, 0.0]
-        axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1)[:, None]
-        beside = seen[:, 1] if rank > 1 else np.eye(3)[np.abs(axes[:, 0]).argmin(axis=1)]
-        axes[:, 1] = beside - np.einsum("ni,ni->n", beside, axes[:, 0])[:, None] * axes[:, 0]
-        axes[:, 1] /= np.linalg.norm(axes[:, 1], axis=1)[:, None]
-        axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
-        return np.einsum("nri,rj->nij", axes, _right_handed(self.columns))
+        return np.einsum("nri,rj->nij", _right_handed(np.einsum("nsi,sr->nri", arms, self.weights)), self.axes)
 
 
 def _right_handed(rows: np.ndarray) -> np.ndarray:
-    """Orthonormal rows (r, 3), r <= 3, completed to a rotation (3, 3) that keeps the first two."""
-    found = np.eye(3)
-    if len(rows):
-        found[0] = rows[0]
-        beside = rows[1] if len(rows) > 1 else np.eye(3)[np.abs(rows[0]).argmin()]
-        beside = beside - beside @ rows[0] * rows[0]
-        found[1] = beside / np.linalg.norm(beside)
-        found[2] = np.cross(found[0], found[1])
-    return found
+    """Rotations (n, 3, 3) whose first two rows are the first two of r <= 3 rows (n, r, 3), orthonormalised."""
+    axes, rank = np.empty((len(rows), 3, 3)), rows.shape[1]
+    axes[:, 0] = rows[:, 0] if rank else [1.0, 0.0, 0.0]
+    axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1)[:, None]
+    beside = rows[:, 1] if rank > 1 else np.eye(3)[np.abs(axes[:, 0]).argmin(axis=1)]
+    axes[:, 1] = beside - np.einsum("ni,ni->n", beside, axes[:, 0])[:, None] * axes[:, 0]
+    axes[:, 1] /= np.linalg.norm(axes[:, 1], axis=1)[:, None]
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return axes
 
 
 #: Singular values of a template below this fraction of the largest are zero: it is flat or a line.

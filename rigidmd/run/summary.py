@@ -285,8 +285,7 @@ def _temperature_scatter(temperature: np.ndarray, freedom: int) -> float | None:
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
     """Values of a minimisation, at its end; None for MOTION_KEYS."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
-    of_stage = samples.of_stage(k)
-    end = Samples(samples.stages, samples.user_terms, of_stage.table()[-1:])
+    end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
     return dict.fromkeys(MOTION_KEYS) | {
         "name": stage.label, "ensemble": stage.ensemble, "steps": 0, "duration_ps": 0.0, "computing_s": computing,
         "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],

@@ -178,8 +178,7 @@ class BodyStart(Section):
     """Velocity of the centre of mass of a body that is not pinned"""
 
     def _errors(self):
-        spins = ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")
-        for keys in (ATTITUDES, spins):
+        for keys in (ATTITUDES, ("euler_rates_rad_s", "angular_velocity_body_rad_s", "angular_velocity_lab_rad_s")):
             given = [key for key in keys if getattr(self, key) is not None]
             if len(given) > 1:
                 yield f"give one of {', '.join(given)}"

@@ -278,8 +278,7 @@ class MolecularScene(Scene):
             yield f"start.temperature_K is missing: {which} is {first.ensemble} and no velocities are read"
         if self.start.temperature_K is not None and from_file:
             yield "start.temperature_K would do nothing: the velocities are read from the structure file"
-        rescaled = first is not None and first.has_thermostat and first.keeps_momentum
-        if self.start.temperature_K == 0 and rescaled:
+        if self.start.temperature_K == 0 and first is not None and first.has_thermostat and first.keeps_momentum:
             yield "start.temperature_K is 0: a thermostat that rescales momenta cannot heat molecules at rest"
         reasons = {
             "box.periodic is false": not self.box.periodic,

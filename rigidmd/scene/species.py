@@ -65,11 +65,6 @@ class Molecules(Section):
     [1, 2, 5] or "1-10, 15": residue numbers of the structure file; or, without a file or if its residues are not the
     molecules, 1, 2, ... within this species"""
 
-    @property
-    def frozen_spans(self) -> list[tuple[int, int]]:
-        """Ranges (first, last) of the numbers of frozen molecules; empty if all or none are frozen."""
-        return [] if isinstance(self.frozen, bool) else spans(self.frozen)
-
     @field_validator("model")
     @classmethod
     def _is_known(cls, model: str | None):

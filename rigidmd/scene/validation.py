@@ -81,8 +81,7 @@ class NameIn:
     def _check(self, name: Any, info: ValidationInfo) -> str:
         *first, last = known = [*self.names, *(info.context or () if self.in_scene else ())]
         if name not in known:
-            expected = f"{', '.join(map(repr, first))} or {last!r}"
-            raise PydanticKnownError("literal_error", {"expected": expected})
+            raise PydanticKnownError("literal_error", {"expected": f"{', '.join(map(repr, first))} or {last!r}"})
         return name
 
     def __get_pydantic_core_schema__(self, source, handler):

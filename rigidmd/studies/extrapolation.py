@@ -45,10 +45,6 @@ class BiasFit(NamedTuple):
     def describe_limit(self) -> str:
         return format_signed(self.limit, self.limit_error).lstrip("+")
 
-    def describe_chi2(self) -> str:
-        """Such as 3.2/4; empty if the fit has as many numbers as points."""
-        return f"{self.chi2:.2g}/{self.freedom}" if self.freedom else ""
-
 
 def extrapolate(points: Sequence[MeanAtStep], exact: float | None = None, order: int = 2) -> BiasFit:
     """The limit of means at a step of zero, from all methods at once and from the short steps that dt^order describes.

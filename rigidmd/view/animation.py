@@ -41,15 +41,6 @@ def default_name() -> str:
     return f"film{EXTENSIONS[0] if ffmpeg() else EXTENSIONS[1]}"
 
 
-def check_writer(path: Path) -> None:
-    """Raise OutputError if a file of this format cannot be written on this machine."""
-    if path.suffix == ".mp4" and ffmpeg() is None:
-        advice = (
-            "install the program, or `pip install imageio-ffmpeg`, which contains it; a .gif needs no other program"
-        )
-        raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}")
-
-
 def write_film(
     folder: Path, path: Path, seconds: float = SECONDS, with_plots: bool = False, height: int | None = None,
     progress: Callable[[float], object] = lambda fraction: None,
@@ -62,7 +53,9 @@ def write_film(
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    check_writer(path)
+    if path.suffix == ".mp4" and ffmpeg() is None:
+        advice = "install the program, or `pip install imageio-ffmpeg`, which contains it"
+        raise OutputError(f"{path}: .mp4 needs ffmpeg: {advice}; a .gif needs no other program")
     record = read_record(folder)
     animation = animation_of(record, MOST_FRAMES)
     begin, (end, notes) = float(animation.time[0]), animation.loop_end()

@@ -134,8 +134,7 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     bonded = _links(axes, m, seen, radius)
     for i in np.argsort(seen[:, 2], kind="stable"):
         _sphere(axes, m, i, seen[i], radius[i])
-    taken = _principal_axes(axes, m, view, half)
-    _labels(axes, m, seen[:, :2], radius, half, taken + bonded)
+    _labels(axes, m, seen[:, :2], radius, half, _principal_axes(axes, m, view, half) + bonded)
     length = 1.0 if half > 1.6 else 0.5
     draw_scale(axes, length - 0.96 * half, -0.95 * half, length, f"{length:g} Å", FONT)
     title, plain = m.title or m.name, {"color": INK, "va": "top", "parse_math": False}
@@ -150,8 +149,7 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     lines.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
     with settings({"svg.hashsalt": m.name}), atomic_file(path) as temporary:
-        metadata = {"Date": None} if path.suffix == ".svg" else None
-        save_figure(figure, temporary, dpi=150, metadata=metadata)
+        save_figure(figure, temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def _view(m: Molecule) -> np.ndarray:
@@ -160,8 +158,7 @@ def _view(m: Molecule) -> np.ndarray:
         return np.eye(3)
     a, b = np.radians([AZIMUTH, LIFT])
     about_up = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    forward = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
-    return forward @ about_up
+    return np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]) @ about_up
 
 
 def _links(axes, m: Molecule, seen: np.ndarray, radius: np.ndarray) -> list[tuple]:

@@ -209,8 +209,7 @@ def show_animation(results: Results) -> "StructureWidget | AnimationPage":
     try:
         import chemiscope
     except ImportError:
-        needed = "rigidmd.view.show() of molecules needs chemiscope: pip install chemiscope"
-        raise ImportError(needed) from None
+        raise ImportError("rigidmd.view.show() of molecules needs chemiscope: pip install chemiscope") from None
     system = results.system
     massive = np.flatnonzero(system.sites.mass > 0)
     frames = _frames(results, system, max(2, MOST_COORDINATES // (3 * len(massive))))

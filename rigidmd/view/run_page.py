@@ -197,8 +197,7 @@ def _margins(record: Record) -> str:
             rows.append([stage["name"], *sizes, Raw(f'<span class="{kind}">{word}</span>')])
     more = "" if record.is_body else " Errors of averages grow long before: see `rigidmd accuracy --averages`."
     text = f'<p class="faint">The longest stable step is estimated from the fastest motion at the start.{more}</p>'
-    titles = ["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""]
-    return table(titles, rows) + text if rows else ""
+    return table(["stage", f"step ({unit})", f"longest stable ({unit})", "fraction", ""], rows) + text if rows else ""
 
 
 #: Fraction of the longest stable step up to which a verdict holds.

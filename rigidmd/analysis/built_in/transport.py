@@ -98,7 +98,13 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
 
     found = AnalysisResult("diffusion", "diffusion coefficients", curves=[_so_far(frames, interval, lags)])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
-    edge = _cubic_edge(frames)
+    edge = None  # of a cubic box
+    distance = frames.system.smallest_diameter  # over which a molecule has to move to change its surroundings
+    if frames.has_box:
+        distance = float((frames.volume.mean() / len(frames.system.model.species)) ** (1 / 3))
+        cell = frames.cell.mean(axis=0)
+        if np.abs(cell - cell[0, 0] * np.eye(3)).max() < 0.01 * cell[0, 0]:
+            edge = float(cell[0, 0])
     eta = Value("viscosity", "mPa s", viscosity_mPa_s, None)
     if viscosity_mPa_s is None:
         try:
@@ -115,7 +121,7 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
             )
             found.values.append(too_short(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, why))
             continue
-        away = _neighbour_distance(frames) ** 2 / (6 * D)
+        away = distance**2 / (6 * D)
         value = converged_value(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, frames.span, away, least=BLOCKS)
         found.values.append(value)
         if value.value is None or edge is None:
@@ -150,22 +156,6 @@ def _so_far(frames: RigidFrames, interval: float, lags: int) -> Curve:
 def _slope(time: np.ndarray, values: np.ndarray) -> float:
     off = time - time.mean()
     return off @ values / (off @ off)
-
-
-def _neighbour_distance(frames: RigidFrames) -> float:
-    """Distance of neighbouring molecules, Å, over which a molecule has to move to change its surroundings."""
-    if not frames.has_box:
-        return frames.system.smallest_diameter
-    return float((frames.volume.mean() / len(frames.system.model.species)) ** (1 / 3))
-
-
-def _cubic_edge(frames: RigidFrames) -> float | None:
-    """The edge of a cubic box, Å, or None."""
-    if not frames.has_box:
-        return None
-    cell = frames.cell.mean(axis=0)
-    edge = float(cell[0, 0])
-    return edge if np.abs(cell - edge * np.eye(3)).max() < 0.01 * edge else None
 
 
 SEGMENTS, SHORTEST = 10, 2.0  # number of segments of the tensor, and the least length of each, ps

@@ -38,8 +38,7 @@ def standard_rotation(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cell (3, 3) with a along x, b in the xy plane and c above it, and the rotation R (3, 3) to that orientation:
     new rows are R times the old ones. In a left-handed cell c changes sign, which does not change the lattice."""
     cell = cell * np.array([1, 1, np.sign(np.linalg.det(cell))])[:, None]
-    longest = np.abs(cell).max()
-    if np.abs(np.triu(cell, 1)).max() <= ORIENTED * longest and (np.diag(cell) > 0).all():
+    if np.abs(np.triu(cell, 1)).max() <= ORIENTED * np.abs(cell).max() and (np.diag(cell) > 0).all():
         return np.tril(cell), np.eye(3)
     q, r = np.linalg.qr(cell.T)
     q = q * np.sign(np.diag(r))

@@ -55,9 +55,6 @@ class Particles(NamedTuple):
         order = np.argsort(self.owner, kind="stable")
         return order[(self.owner[order] != order) | (size[order] == 1)]
 
-    def rotation(self) -> np.ndarray:
-        return from_quaternion(self.orientation[self.centres])
-
     def site_velocities(self) -> np.ndarray | None:
         """Velocities of the sites, from the rigid bodies, because HOOMD stores none of constituents."""
         if self.velocity is None:
@@ -131,8 +128,8 @@ class GsdReader:
 
     def frame(self, k: int) -> Frame:
         found = self.read(k)
-        where = found.position[found.sites]
-        return Frame(found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step)
+        where, rotation = found.position[found.sites], from_quaternion(found.orientation[found.centres])
+        return Frame(found.time, where, found.cell, found.site_velocities(), rotation, found.step)
 
     @property
     def sites(self) -> int:
@@ -273,8 +270,7 @@ class GsdFile(FrameFile):
         return frame
 
     def _arrays(self, frame: Any) -> list[np.ndarray]:
-        changing = [getattr(frame.particles, name) for name in self._changing]
-        return [frame.configuration.box, frame.log[TIME], *changing]
+        return [frame.configuration.box, frame.log[TIME], *(getattr(frame.particles, name) for name in self._changing)]
 
 
 def _labels(system: System) -> np.ndarray:

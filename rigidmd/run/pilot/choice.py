@@ -73,8 +73,7 @@ def measure_energy_walk(system: TrialSystem, timestep: float) -> EnergyWalk:
     jump = min(JUMPS, key=lambda k: abs(log(fast / slow) - (2 * k + 2) * log(2)))
     dt = timestep * system.time_size
     unit = EnergyWalk(1.0, jump, system.freedom)
-    scale = (fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2
-    return unit._replace(scale=scale)
+    return unit._replace(scale=(fast / unit.rate(scheme, dt) + slow / unit.rate(scheme, dt / 2)) / 2)
 
 
 def _rate(system: TrialSystem, timestep: float, steps: int) -> float | None:

@@ -43,10 +43,6 @@ class Method(NamedTuple):
     scheme: Scheme | Solver
 
     @property
-    def chooses_steps(self) -> bool:
-        return isinstance(self.scheme, Solver) and self.scheme.name != RK4
-
-    @property
     def force_evaluations(self) -> int:
         """Evaluations in a step of given length."""
         return 4 if isinstance(self.scheme, Solver) else self.scheme.force_evaluations
@@ -278,7 +274,8 @@ def plan(system: TrialSystem, steps: dict[str, list[float]]) -> list[Trial]:
     that choose their steps get tolerances instead."""
     trials = {}
     for integrator, timesteps in steps.items():
-        if system.methods[integrator].chooses_steps:
+        scheme = system.methods[integrator].scheme
+        if isinstance(scheme, Solver) and scheme.name != RK4:
             step = system.span / OBSERVATIONS / system.time_size
             for tolerance in TOLERANCES:
                 trials[integrator, tolerance] = Trial(integrator, step, OBSERVATIONS, 0, tolerance=tolerance)

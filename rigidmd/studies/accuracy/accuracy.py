@@ -161,15 +161,11 @@ def remarks(found: IntegratorAccuracy) -> list[str]:
     ]
     if s.rounding is not None:
         force, torque = s.rounding
-        lines.append(
-            f"mixed precision: forces differ from double ones by {force:.1e} of their rms"
-            + (f", torques by {torque:.1e}" if torque else "")
-            + (
-                "; trials with long steps have it, others and the reference are in double precision"
-                if s.chooses_precision
-                else "; the reference is in mixed precision too"
-            )
-        )
+        torques = f", torques by {torque:.1e}" if torque else ""
+        which = "the reference is in mixed precision too"
+        if s.chooses_precision:
+            which = "trials with long steps have it, others and the reference are in double precision"
+        lines.append(f"mixed precision: forces differ from double ones by {force:.1e} of their rms{torques}; {which}")
     for name in dict.fromkeys(t.integrator for t in found.trials):
         failures = [t.failure for t in found.trials if t.integrator == name and t.failure]
         if "diverges" in failures:

@@ -217,8 +217,7 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
         interval = scene.output.log_interval_ps if scene.stages[-1].volume else 1e9
         quiet = scene.output.model_copy(update={"trajectory": False, "log_interval_ps": interval})
         resolved = simulation.scene
-        earlier = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet}))
-        results = earlier.run()
+        results = Simulation(resolved.model_copy(update={"stages": resolved.stages[:-1], "output": quiet})).run()
         scale_to_mean_box(simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1)
         return simulation, results.state
     simulation.start()

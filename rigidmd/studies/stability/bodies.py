@@ -270,8 +270,7 @@ def sleeping_top(result: CaseResult, quick: bool) -> None:
             # the error of a step shifts the threshold by about its square for order 2
             step = (0.02 if quick else 0.1) * abs(gap) ** 0.5 if family.startswith(SPLIT) else 0.05
             tilt = lambda results, known=known: abs(np.log(results["theta"].max() / known))  # noqa: E731
-            outcome = run_body(data, step, span, family, tilt, samples=2000)
-            result.add(f"1 {gap:+.0e}", outcome, 0.05, family, step)
+            result.add(f"1 {gap:+.0e}", run_body(data, step, span, family, tilt, samples=2000), 0.05, family, step)
 
 
 @register(5, error="error of Q")

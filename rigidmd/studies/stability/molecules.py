@@ -82,8 +82,7 @@ def overlaps(result: CaseResult, quick: bool) -> None:
         state.position[:, 1] = 10.0
         result.add(f"file with {ratio:g} sigma", from_file(data, state), 0.0, SPLIT, 0.01, (REFUSED,))
     for density in (5.0, 50.0):
-        edge = (4 * 36.0 / (density * 0.602214)) ** (1 / 3)
-        cutoff = {"cutoff_A": 0.45 * edge}
+        cutoff = {"cutoff_A": 0.45 * (4 * 36.0 / (density * 0.602214)) ** (1 / 3)}
         species, box = [bent() | {"count": 4}], {"density_g_cm3": density}
         data = molecules_scene(species, box, 0.5, 100, SPLIT, 300.0, None, cutoff)
         result.add(f"lattice of {density:g} g/cm³", run_molecules(data), 0.01, SPLIT, 0.5, (REFUSED,))
@@ -306,8 +305,7 @@ def no_numbers(result: CaseResult, quick: bool) -> None:
         "friction": {"viscous_N_m_s": [0.1, 0.1, 0.1], "dry_N_m": [0.1, 0.1, 0.1]},
         "applied": [{"torque_N_m": [0.1, 0.2, 0.3], "from_s": 0.1, "to_s": 0.2}],
     }
-    body = body_scene(tables, 0.01, 1.0, EXACT)
-    for setting, data in (("molecules", molecules), ("body", body)):
+    for setting, data in (("molecules", molecules), ("body", body_scene(tables, 0.01, 1.0, EXACT))):
         for keys, value, bad in spoiled(data):
             name = f"{setting}, {'.'.join(map(str, keys))} = {value}"
             result.add(name, run_invalid(bad), 0.0, setting, expected=(REFUSED,))

@@ -61,8 +61,7 @@ def water_steps(result: CaseResult, quick: bool) -> None:
             span = (500 if quick else 1000) * step
 
             def at(h: float, family=family, state=state, scale=scale, span=span) -> Outcome:
-                data = water_scene("spce", h, max(200, round(span / h)), family, 0.0)
-                return run_molecules(data, state, scale=scale)
+                return run_molecules(water_scene("spce", h, max(200, round(span / h)), family, 0.0), state, scale=scale)
 
             result.add(f"{temperature:g} K", at(step), 0.02, family, step)
             result.limits.append(longest_step(at, step, f"{temperature:g} K", family))
@@ -76,8 +75,7 @@ def tip4p_steps(result: CaseResult, quick: bool) -> None:
     for family in (SPLIT,) if quick else QUICK:
 
         def at(h: float, family=family) -> Outcome:
-            data = water_scene("tip4p", h, 300 if quick else 1000, family, 0.0)
-            return run_molecules(data, state, scale=scale)
+            return run_molecules(water_scene("tip4p", h, 300 if quick else 1000, family, 0.0), state, scale=scale)
 
         for step in STEPS[:1] if quick else STEPS:
             allowed, expected = 0.02 if step <= 1 else 1.0, (RIGHT, REPORTED, REFUSED)

@@ -66,7 +66,9 @@ class Limits(NamedTuple):
         found += [
             Column("average", lambda limit: SHORT.get(limit.quantity, limit.quantity)),
             Column("limit", lambda limit: limit.fit.describe_limit()),
-            Column("chi²/dof", lambda limit: limit.fit.describe_chi2() or None),
+            Column(
+                "chi²/dof", lambda limit: f"{limit.fit.chi2:.2g}/{limit.fit.freedom}" if limit.fit.freedom else None
+            ),
             Column("to (fs)", lambda limit: f"{limit.fit.longest:g}"),
         ]
         for step in self.steps:

@@ -129,7 +129,8 @@ def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> T
             try:
                 found = summarise_run(read_record(folder / point.folder))
                 if with_analyses:
-                    found |= _analysed(folder / point.folder)
+                    values = [v for entry in read_table(folder / point.folder).values() for v in entry.values]
+                    found |= {v.header: (v.value, v.error) for v in values if v.value is not None}
             except RigidMDError as error:
                 failed[point.folder] = str(error)
                 continue
@@ -161,12 +162,6 @@ def summarise_run(record: Record) -> dict[str, Measured]:
     if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
         found[DRIFT] = drift, stages[-1].get("drift_error_kT_ns_per_degree_of_freedom")
     return found
-
-
-def _analysed(folder: Path) -> dict[str, Measured]:
-    """The values of analyses of a run, by name and unit."""
-    values = [value for entry in read_table(folder).values() for value in entry.values]
-    return {value.header: (value.value, value.error) for value in values if value.value is not None}
 
 
 def _summarise_motion(record: Record) -> dict[str, Measured]:
