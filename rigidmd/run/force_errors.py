@@ -1,6 +1,7 @@
 """Errors of the forces of a scene: of Ewald sums, estimated and measured; of single precision between pairs; of
 user-defined forces, which are compared with their energies."""
 
+# isort: skip_file
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf, pi, sqrt
@@ -17,13 +18,8 @@ from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.errors import (
-    charges_in,
-    filled_fraction,
-    k_cutoff_of_count,
-    k_space_error,
-    pme_error,
-    real_error,
-)
+    charges_in, filled_fraction, k_cutoff_of_count, k_space_error, pme_error, real_error,
+)  # fmt: skip
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb

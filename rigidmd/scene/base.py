@@ -3,11 +3,11 @@
 # isort: skip_file
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
 
-from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.files import unreadable_reason
@@ -17,6 +17,7 @@ from rigidmd.core.toml import (
     DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
 )  # fmt: skip
 from rigidmd.errors import SceneError
+from rigidmd.io.formats import Format, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
     MOST_TABLES, Section, did_you_mean, exact_names, location_of, numbers_out_of_range, similar_names, suggestion,
@@ -218,15 +219,21 @@ def _similar_files(path: Path, suffix: str = "") -> str:
     return suggestion([other.name for other in there if other.stem in stems])
 
 
-def file_name(name: str, extensions: tuple[str, ...]) -> str:
-    """A plain file name with one of these extensions. Raises ValueError."""
-    if not re.fullmatch(r"[\w\-][\w.\-]*", name):
-        raise ValueError(f"is {name!r}, must be a plain file name without a folder")
-    if name.startswith("input_"):
-        raise ValueError(f"is {name!r}; names beginning with input_ are reserved for copies of input files")
-    if not name.endswith(extensions):
-        raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
-    return name
+def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
+    """Annotation of a plain file name with an extension that is written of the formats for which `wanted` is true."""
+
+    def check(name):
+        if name is None or name is False:
+            return name
+        if not re.fullmatch(r"[\w\-][\w.\-]*", name):
+            raise ValueError(f"is {name!r}, must be a plain file name without a folder")
+        if name.startswith("input_"):
+            raise ValueError(f"is {name!r}; names beginning with input_ are reserved for copies of input files")
+        if not name.endswith(extensions := written(wanted)):
+            raise ValueError(f"is {name!r}, must end in one of {' '.join(extensions)}")
+        return name
+
+    return AfterValidator(check)
 
 
 def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):

@@ -7,10 +7,10 @@ The equations contain no physical constants, so any other consistent units work 
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, Strict, field_validator
+from pydantic import Field, Strict
 
 from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
-from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY, written
+from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION, SOLIDS, inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
     angular_velocity_of_euler_rates, from_attitude_matrix, from_euler_angles, from_quaternion, from_yaw_pitch_roll,
@@ -272,9 +272,9 @@ class BodyOutput(Section):
     """Time between samples in motion.csv and the trajectory; default: the duration divided by 2000"""
     npz: Flag = False
     """Also write motion.npz, the same columns as arrays"""
-    trajectory: str | Literal[False] = TRAJECTORY
+    trajectory: Annotated[str | Literal[False], file_name(lambda form: form.encoder and not form.even)] = TRAJECTORY
     """Trajectory of points of the body for viewers; the extension sets the format; false for none"""
-    topology: str | None = None
+    topology: Annotated[str | None, file_name(lambda form: form.write_topology)] = None
     """Topology file that viewers need for the trajectory (.gro, or .pdb, in which bonds are the edges of the body);
     default: topology.pdb, or topology.gro for a body that starts more than 900 Å of the trajectory away"""
     trajectory_A_per_m: Positive | None = None
@@ -291,16 +291,6 @@ class BodyOutput(Section):
     of the body, or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default:
     the solid or the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if
     it is pinned outside; else a cuboid"""
-
-    @field_validator("trajectory")
-    @classmethod
-    def _trajectory_name(cls, name):
-        return name if name is False else file_name(name, written(lambda form: form.encoder and not form.even))
-
-    @field_validator("topology")
-    @classmethod
-    def _topology_name(cls, name: str | None):
-        return name if name is None else file_name(name, written(lambda form: form.write_topology))
 
     def _errors(self):
         if self.trajectory and self.trajectory == (self.topology or BODY_TOPOLOGY):

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
-from pydantic import Field, PrivateAttr, Strict, field_validator
+from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.toml import shorten_repr
 from rigidmd.errors import SceneError
@@ -82,12 +82,12 @@ class Output(Section):
     pressure_tensor_interval_ps: Interval | Literal[False] = False
     """Time between lines of pressure_tensor.csv, for a viscosity: 0.01 ps for water; false for none. Each line needs an
     evaluation of forces with the virial"""
-    trajectory: str | Literal[False] = TRAJECTORY
+    trajectory: Annotated[str | Literal[False], file_name(lambda form: form.encoder or form.writer)] = TRAJECTORY
     """Trajectory file; the extension sets the format (.xtc .trr .gsd .traj .dcd .nc .xyz .pdb); .gsd stores rotations
     and angular momenta, .traj is ASE's and has double precision; false for none"""
     trajectory_interval_ps: Interval = 0.5
     """Time between frames"""
-    topology: str = TOPOLOGY
+    topology: Annotated[str, file_name(lambda form: form.write_topology)] = TOPOLOGY
     """File with names and first positions that viewers need for the trajectory (.gro or .pdb)"""
     positions: Literal["wrapped", "unwrapped"] = "unwrapped"
     """unwrapped: continuous paths, for displacements; wrapped: centres of mass inside the box. Molecules are whole in
@@ -98,16 +98,6 @@ class Output(Section):
     """Draw energy.png"""
     checkpoint_minutes: Minutes = 5.0
     """Wall time between checkpoints, from which `rigidmd resume` continues a run; false for none"""
-
-    @field_validator("trajectory")
-    @classmethod
-    def _trajectory_name(cls, name):
-        return name if name is False else file_name(name, written(lambda form: form.encoder or form.writer))
-
-    @field_validator("topology")
-    @classmethod
-    def _topology_name(cls, name: str):
-        return file_name(name, written(lambda form: form.write_topology))
 
     def _errors(self):
         if self.velocities and not self.can_store_velocities:

@@ -55,6 +55,9 @@ class Particles(NamedTuple):
         order = np.argsort(self.owner, kind="stable")
         return order[(self.owner[order] != order) | (size[order] == 1)]
 
+    def rotation(self) -> np.ndarray:
+        return from_quaternion(self.orientation[self.centres])
+
     def site_velocities(self) -> np.ndarray | None:
         """Velocities of the sites, from the rigid bodies, because HOOMD stores none of constituents."""
         if self.velocity is None:
@@ -128,8 +131,8 @@ class GsdReader:
 
     def frame(self, k: int) -> Frame:
         found = self.read(k)
-        where, rotation = found.position[found.sites], from_quaternion(found.orientation[found.centres])
-        return Frame(found.time, where, found.cell, found.site_velocities(), rotation, found.step)
+        where = found.position[found.sites]
+        return Frame(found.time, where, found.cell, found.site_velocities(), found.rotation(), found.step)
 
     @property
     def sites(self) -> int:
