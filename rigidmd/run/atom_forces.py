@@ -23,6 +23,7 @@ from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.io.formats import format_of
 from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
+from rigidmd.mechanics.rotation import hat
 from rigidmd.run.force_errors import forces_inside
 from rigidmd.run.rigid_fit import kinds_of
 from rigidmd.scene.models import Molecule
@@ -240,11 +241,6 @@ def _transfer_matrices(molecule: Molecule, site: int) -> np.ndarray:
     weight = np.linalg.lstsq(rows, np.append(position, 1.0), rcond=COMBINATION_TOLERANCE)[0]
     if np.abs(rows @ weight - np.append(position, 1.0)).max() <= COMBINATION_TOLERANCE * max(molecule.radius, 1.0):
         return weight[:, None, None] * np.eye(3)
-    totals = np.hstack([np.vstack([np.eye(3), _cross(x)]) for x in heavy])
-    of_site = np.vstack([np.eye(3), _cross(position)])
+    totals = np.hstack([np.vstack([np.eye(3), hat(x)]) for x in heavy])
+    of_site = np.vstack([np.eye(3), hat(position)])
     return (np.linalg.pinv(totals, rcond=COMBINATION_TOLERANCE) @ of_site).reshape(-1, 3, 3)
-
-
-def _cross(x: np.ndarray) -> np.ndarray:
-    """The matrix (3, 3) of the product x x f."""
-    return np.cross(np.eye(3), x)

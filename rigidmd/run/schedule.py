@@ -77,11 +77,7 @@ class CheckpointSchedule:
         self._seconds, self._deadline = 60.0 * minutes, deadline
         self._last, self._longest_write = clock.monotonic(), 0.0
         self._written: tuple[int, int, bool] | None = None
-        self.requested = False
-
-    @property
-    def writes(self) -> bool:
-        return self._folder is not None
+        self.requested, self.writes = False, self._folder is not None
 
     @property
     def is_due(self) -> bool:

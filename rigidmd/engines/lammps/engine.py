@@ -66,7 +66,7 @@ def installed() -> str:
 
 
 class LammpsEngine(ExternalEngine):
-    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. `lammps.translations` has all it can do."""
+    """Moves molecules by LAMMPS. Raises EngineError if it is not installed. `files.TRANSLATIONS` has all it can do."""
 
     def __init__(self, system: System, stage: int = 0, ranks: int = 1):
         super().__init__(system, stage)

@@ -54,7 +54,7 @@ def properties_of(platform: str, precision: str | None, threads: int | None) -> 
 
 
 class OpenmmEngine(ExternalEngine):
-    """Moves molecules by OpenMM. Raises EngineError if it is not installed. `openmm.translations` has all it can do."""
+    """Moves molecules by OpenMM. Raises EngineError if it is not installed. `system.TRANSLATIONS` has all it can do."""
 
     length_tolerance = 2.0**-24  # SETTLE has its distances in single precision, on all platforms
 

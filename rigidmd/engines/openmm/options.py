@@ -28,7 +28,7 @@ def _describe(platform: str, precision: str | None) -> str:
 
 PROGRAM = Program(
     "OpenMM", "pip install openmm installs it, and 'openmm[cuda12]' its platform CUDA too",
-    "translations:TRANSLATIONS", engine="engine:OpenmmEngine", installed="engine:installed",
+    "system:TRANSLATIONS", engine="engine:OpenmmEngine", installed="engine:installed",
     options={
         "platform": Option(PLATFORMS, "CPU", "Platform of openmm; default: CPU"),
         "precision": Option(
