@@ -102,6 +102,17 @@ def new_figure(width: float, height: float, layout: Any = "constrained", title: 
     return figure
 
 
+def panel_grid(count: int, across: int, width: float, height: float, margin: float) -> "tuple[Picture, list[Any]]":
+    """A figure of panels in rows of at most `across`, and the axes of the panels. Inches: of a panel, and below all."""
+    across = min(across, max(1, count))
+    down = max(1, -(-count // across))
+    figure = new_figure(width * across, height * down + margin)
+    axes = list(figure.subplots(down, across, squeeze=False).flat)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes[:count]
+
+
 def open_axis(axis, **ticks) -> None:
     """Draw an axis without its frame on top and right, with these settings of ticks, in ink."""
     axis.spines[["top", "right"]].set_visible(False)

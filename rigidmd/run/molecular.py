@@ -134,8 +134,7 @@ class MolecularRun(RunPart):
     def prepare(self) -> None:
         """Remove overlaps, and compile the steps, or compare the start with an external engine."""
         if self.scene.engine.is_external:
-            from rigidmd.engines.comparison import compare_at, describe_comparison
-            from rigidmd.engines.external import external_engine
+            from rigidmd.engines.external import compare_at, describe_comparison, external_engine
 
             other = external_engine(self.system)  # first: the error of a missing program comes before compilation
             try:

@@ -1,6 +1,7 @@
 """Scenes and other engines. `rigidmd export` writes a scene as a folder that another engine runs by itself. `rigidmd
 verify` compares a scene on two engines: its start term by term, then a short run of both at constant energy."""
 
+# isort: skip_file
 import tempfile
 from dataclasses import replace
 from itertools import pairwise
@@ -13,8 +14,9 @@ from rigidmd.assemble.build import build
 from rigidmd.core.files import writing
 from rigidmd.core.integrators import SCHEMES
 from rigidmd.core.state import NOW, State
-from rigidmd.engines.comparison import ERRORS, Comparison, compare_at, describe_comparison
-from rigidmd.engines.external import ExternalEngine, checked_view, external_engine
+from rigidmd.engines.external import (
+    ERRORS, Comparison, ExternalEngine, checked_view, compare_at, describe_comparison, external_engine,
+)  # fmt: skip
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.registry import programs, runnable
 from rigidmd.engines.system import System

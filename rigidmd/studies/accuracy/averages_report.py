@@ -4,7 +4,7 @@ from itertools import groupby
 from pathlib import Path
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.write import Column, Table, with_error, write_json
 from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
 from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
@@ -143,13 +143,10 @@ def _run_to_json(found: Averages, run: AverageRun) -> dict:
 def averages_figure(found: Averages):
     """Bias against the step, a panel for each quantity, with error bars and the band within 1 %."""
     shown = [quantity for quantity in found.main if found.points(quantity)]
-    columns = min(3, max(1, len(shown)))
-    rows = max(1, -(-len(shown) // columns))
-    figure = new_figure(3.7 * columns, 3.0 * rows + 0.9)
-    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    figure, axes = panel_grid(len(shown), 3, 3.7, 3.0, 0.9)
     methods = methods_of(found)
     handles = {}
-    for axis, quantity in zip(axes, shown, strict=False):
+    for axis, quantity in zip(axes, shown, strict=True):
         limit = found.bias_limit(quantity)
         axis.axhspan(-limit, limit, color=FAINT, alpha=0.15, lw=0)
         axis.axhline(0, color=INK, lw=0.7)
@@ -163,9 +160,7 @@ def averages_figure(found: Averages):
                       textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
         open_axis(axis)
-    for axis in axes[len(shown) :]:
-        axis.set_visible(False)
-    for axis in axes[max(0, len(shown) - columns) : len(shown)]:
+    for axis in axes[-3:]:
         axis.set_xlabel("time step, fs", color=INK)
     figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=2,
                   labelcolor=INK)  # fmt: skip

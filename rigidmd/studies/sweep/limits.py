@@ -1,7 +1,6 @@
 """Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and .html."""
 
 import csv
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import SceneError
-from rigidmd.figures.style import INK, curve_style, new_figure, open_axis, write_figure
+from rigidmd.figures.style import INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.folder import SCENE, add_to_folder
 from rigidmd.io.write import Column, Table, nine_digits, with_error
 from rigidmd.scene import MolecularScene, Scene
@@ -183,14 +182,11 @@ def _figure(found: Limits):
     of_log = {column.header for column in COLUMNS.values()}
     rank = lambda name: MAIN.index(name) if name in MAIN else len(MAIN) + (name in of_log)  # noqa: E731
     shown = sorted(dict.fromkeys(limit.quantity for limit in found.limits), key=rank)[:MOST_PANELS]
-    across = min(ACROSS, len(shown))
-    down = -(-len(shown) // across)
-    figure = new_figure(3.7 * across, 2.8 * down + 0.5)
-    axes: Sequence = list(figure.subplots(down, across, squeeze=False).flat)
+    figure, axes = panel_grid(len(shown), ACROSS, 3.7, 2.8, 0.5)
     short = short_keys(found.limits[0].values)
     labels = list(dict.fromkeys(describe_values(limit.values, short) for limit in found.limits))
     handles = {}
-    for axis, name in zip(axes, shown, strict=False):
+    for axis, name in zip(axes, shown, strict=True):
         for limit in (limit for limit in found.limits if limit.quantity == name):
             label, fit = describe_values(limit.values, short), limit.fit
             style = curve_style(labels.index(label)) | {"ls": "none", "ms": 4, "capsize": 2.5, "elinewidth": 0.9}
@@ -204,9 +200,7 @@ def _figure(found: Limits):
         axis.set_xlim(left=0)
         axis.ticklabel_format(axis="y", useOffset=False)
         open_axis(axis, labelsize=8)
-    for axis in axes[len(shown) :]:
-        axis.set_visible(False)
-    for axis in axes[max(0, len(shown) - across) : len(shown)]:
+    for axis in axes[-ACROSS:]:
         axis.set_xlabel("time step, fs", fontsize=9, color=INK)
     if len(labels) > 1:
         figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside lower left", ncols=3,

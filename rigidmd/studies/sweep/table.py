@@ -14,7 +14,7 @@ from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
-from rigidmd.figures.style import FAINT, INK, curve_style, new_figure, open_axis, write_figure
+from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.write import Column, nine_digits, with_error
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
@@ -245,11 +245,8 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
     key = [*numbers, *table.keys, SEED][0]
     # the values at x = 0, 1, ... if they are not numbers
     words = list(dict.fromkeys(map(value_name, columns[key]))) if table.keys and not numbers else []
-    across = min(ACROSS, len(shown))
-    down = -(-len(shown) // across)
-    figure = new_figure(WIDTH * across, HEIGHT * down + 0.4)
-    axes = list(figure.subplots(down, across, squeeze=False).flat)
-    for axis, column in zip(axes, shown, strict=False):
+    figure, axes = panel_grid(len(shown), ACROSS, WIDTH, HEIGHT, 0.4)
+    for axis, column in zip(axes, shown, strict=True):
         curves = _curves(table, rows, key, words, column)
         _draw(axis, curves, None if table.keys else rows[0][column])
         axis.set_title(column, loc="left", fontsize=9, color=INK)
@@ -261,8 +258,6 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
             axis.set_xlim(-0.5, len(words) - 0.5)
         elif all(float(x).is_integer() for at, _, _ in curves.values() for x in at):
             axis.locator_params(axis="x", integer=True)
-    for axis in axes[len(shown) :]:
-        axis.axis("off")
     handles, labels = axes[0].get_legend_handles_labels()
     if 1 < len(labels) <= MOST_NAMED:
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=INK)
