@@ -331,14 +331,10 @@ def frame_of(scene: BodyScene):
 
 def resistance_of(scene: BodyScene):
     friction, fluid = scene.friction or Friction(), scene.fluid or Fluid()
-    parts = (
-        np.array(fluid.linear_resistance_kg_s),
-        np.array(fluid.quadratic_resistance_kg_m),
-        np.array(friction.dry_N_m),
-        np.array(friction.viscous_N_m_s) + np.array(fluid.linear_rotational_resistance_N_m_s),
-        np.array(fluid.quadratic_rotational_resistance_N_m_s2),
-    )
-    return Resistance(*parts) if any(part.any() for part in parts) else NoResistance()
+    viscous = np.add(friction.viscous_N_m_s, fluid.linear_rotational_resistance_N_m_s)
+    of_translation = fluid.linear_resistance_kg_s, fluid.quadratic_resistance_kg_m
+    parts = np.array([*of_translation, friction.dry_N_m, viscous, fluid.quadratic_rotational_resistance_N_m_s2])
+    return Resistance(*parts) if parts.any() else NoResistance()
 
 
 def terms_of(scene: BodyScene, mass: float, axes: np.ndarray, centre: np.ndarray, displaced: float):

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
+from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.io.formats.cells import pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
@@ -160,8 +161,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
     """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees."""
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-    from scipy.spatial.distance import cdist
+    from scipy.sparse.csgraph import connected_components
 
     numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
     reach = np.zeros((len(numbers), len(numbers)))
@@ -169,9 +169,8 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
         sites = massive_sites(molecule)
         points = molecule.positions_body[sites]
         number = [numbers[_labels(molecule)[s]] for s in sites]
-        tree = minimum_spanning_tree(cdist(points, points)).tocoo()
-        for i, j, length in zip(tree.row, tree.col, tree.data, strict=True):
-            one, other = number[i], number[j]
+        for i, j in shortest_links(points):
+            one, other, length = number[i], number[j], float(np.linalg.norm(points[i] - points[j]))
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
     with_mass = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
     number = np.array([numbers[kinds[i]] for i in with_mass], int)

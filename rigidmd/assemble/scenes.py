@@ -82,12 +82,9 @@ def scene_from_atoms(
     data.setdefault("name", atoms.get_chemical_formula()[:40])
     ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
     if ignored:
-        warnings.warn(
-            f"the constraints of the atoms are ignored ({', '.join(ignored)}): freeze molecules by the models, "
-            'models=[{"model": "spce", "frozen": [1, 2]}]',
-            RigidMDWarning,
-            stacklevel=3,
-        )
+        advice = 'freeze molecules by the models, models=[{"model": "spce", "frozen": [1, 2]}]'
+        what = f"the constraints of the atoms are ignored ({', '.join(ignored)})"
+        warnings.warn(f"{what}: {advice}", RigidMDWarning, stacklevel=3)
     return MolecularScene.from_dict(data, source=SOURCE, embedded_files={"structure.file": text_of(atoms).encode()})
 
 

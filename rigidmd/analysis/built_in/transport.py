@@ -94,7 +94,10 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
 
     def slopes(part: RigidFrames, kind: Kind) -> np.ndarray:
         seen = _displacements(part, kind, lags)[first:]
-        return np.array([_slope(time, seen), _slope(time[half:], seen[half:]) - _slope(time[:half], seen[:half])]) / 6
+        whole, first_half, second_half = (
+            np.polyfit(time[part], seen[part], 1)[0] for part in (slice(None), slice(half), slice(half, None))
+        )
+        return np.array([whole, second_half - first_half]) / 6
 
     found = AnalysisResult("diffusion", "diffusion coefficients", curves=[_so_far(frames, interval, lags)])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
@@ -151,11 +154,6 @@ def _so_far(frames: RigidFrames, interval: float, lags: int) -> Curve:
         found = with_group_error(frames, kind, lambda part, group: _displacements(part, group, lags)[1:] / size)
         curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *found)
     return curve
-
-
-def _slope(time: np.ndarray, values: np.ndarray) -> float:
-    off = time - time.mean()
-    return off @ values / (off @ off)
 
 
 SEGMENTS, SHORTEST = 10, 2.0  # number of segments of the tensor, and the least length of each, ps
