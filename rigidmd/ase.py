@@ -1,9 +1,11 @@
-"""rigidmd as a calculator of ASE.
+"""rigidmd as a calculator of ASE, and calculators of ASE as forces on rigid molecules.
 
-from rigidmd.ase import RigidMD
+from rigidmd.ase import CalculatorForce, RigidMD
 
 atoms.calc = RigidMD(["spce"], cutoff_A=9.0, electrostatics="pme")
 atoms.get_potential_energy()
+
+results = rigidmd.Simulation(scene, forces=[CalculatorForce(calculator)]).run()
 """
 
 import warnings
@@ -20,13 +22,14 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, refit
 from rigidmd.assemble.scenes import SOURCE, atoms_errors, scene_from_atoms
 from rigidmd.assemble.species import species_of
-from rigidmd.core.state import State, state_of
+from rigidmd.assemble.user_code.force import Force, UserForceError
+from rigidmd.core.state import NOW, State, state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
-from rigidmd.errors import RigidMDWarning, SceneError, StructureError
+from rigidmd.errors import RigidMDWarning, SceneError, StructureError, describe_error
 from rigidmd.io.formats import STRUCTURE
 from rigidmd.io.formats.cells import basis_of, least_skewed_cell, standard_rotation
-from rigidmd.io.formats.through_ase import atoms_of_sites
+from rigidmd.io.formats.through_ase import EV, atoms_of_sites
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.io.trajectory import read_frames
 from rigidmd.run.atom_forces import Form, ase_results
@@ -37,8 +40,9 @@ from rigidmd.scene import MolecularScene, Scene
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.units import KJ_PER_MOL
 
-__all__ = ["RigidMD"]
+__all__ = ["CalculatorForce", "RigidMD"]
 
 #: Largest strain of the cell for which numbers such as the grid of PME are kept.
 LARGEST_STRAIN = 0.1
@@ -265,6 +269,90 @@ class _Assembly(NamedTuple):
     def rigid(self, state: State) -> np.ndarray:
         """Positions (a, 3) of the sites with mass."""
         return self.system.site_positions(state)[self.system.sites.mass > 0]
+
+
+class CalculatorForce(Force):
+    """Forces on the atoms of rigid molecules from a calculator of ASE.
+
+    The calculator is called once for each new set of positions, with one `ase.Atoms` of all sites with mass, molecules
+    whole, in the order of `system.sites`. Forces within molecules have no effect. Its stress gives the molecular virial
+    W = -V sigma - sum_i f_i (x) (r_i - R); the page `calculators` (`rigidmd help calculators`) has the derivation.
+
+    Parameters
+    ----------
+    calculator : with energies (eV) and forces (eV/Å) of periodic or free atoms, as the scene has them, and for a
+        barostat or the pressure with a stress (eV/Å³)
+    name : in logs and messages; default: the name of the calculator's class
+    energy_noise_eV : random error of its energies, as of self-consistent iterations or of single precision; larger
+        differences between forces and differences of the energy are refused at the start of a run
+    changes_momentum : which components of the total momentum it may change: True for external fields and restraints
+
+    Raises SceneError where a calculator without stress is used with a barostat, and SimulationError with the step and
+    the closest atoms if the calculator fails.
+    """
+
+    def __init__(
+        self, calculator: Any, *, name: str | None = None, energy_noise_eV: float = 0.0,
+        changes_momentum: bool | Sequence[bool] = False,
+    ):  # fmt: skip
+        if not (hasattr(calculator, "calculate") and hasattr(calculator, "implemented_properties")):
+            raise ValueError(f"calculator is {calculator!r:.60}, must be a calculator of ASE")
+        if not 0 <= energy_noise_eV < np.inf:
+            raise ValueError(f"energy_noise_eV is {energy_noise_eV!r}, must be a finite number, not negative")
+        self.calculator = calculator
+        self.name = name or type(calculator).__name__  # type: ignore[misc]  # of each object here
+        self.energy_noise = energy_noise_eV * EV / KJ_PER_MOL  # type: ignore[misc]
+        self.changes_momentum = changes_momentum  # type: ignore[misc,assignment]
+
+    def begin(self, system: System) -> None:
+        """Make the atoms, and choose the properties that the calculator is asked for."""
+        can, periodic = self.calculator.implemented_properties, bool(np.isfinite(system.state.cell).all())
+        if missing := [name for name in ("energy", "forces") if name not in can]:
+            raise UserForceError(f"the calculator has no {' and no '.join(missing)}")
+        self._has_virial = periodic and "stress" in can
+        stages = [stage.label for stage in system.scene.stages if stage.changes_box]
+        if stages and not self._has_virial:
+            raise UserForceError(f"the stage {stages[0]} changes the box, and the calculator has no stress")
+        if periodic and not self._has_virial:
+            system.notes.append(f"{self.name} has no stress: the pressure does not include it")
+        self.tied_to_places = periodic and not self._has_virial  # type: ignore[misc]
+        self._sites = system.sites
+        self.atoms = atoms_of_sites(system, system.site_positions(system.state), None, system.state.cell, 0.0)
+
+    def on_sites(self, position: np.ndarray, state: State) -> tuple:
+        """Energy, forces on all sites, and the molecular virial where there is a stress."""
+        sites, calculator, unit = self._sites, self.calculator, EV / KJ_PER_MOL
+        atom = sites.mass > 0
+        self.atoms.positions[:] = position[atom]
+        if self.atoms.pbc.all():
+            self.atoms.set_cell(state.cell)
+        try:
+            if changes := calculator.check_state(self.atoms):
+                calculator.reset()
+                wanted = ["energy", "forces", "stress"] if self._has_virial else ["energy", "forces"]
+                calculator.calculate(self.atoms, wanted, changes)
+            found = calculator.results
+            energy, on_sites = found.get("free_energy", found["energy"]) * unit, np.zeros(position.shape)
+            on_sites[atom] = unit * np.asarray(found["forces"])
+            if not self._has_virial:
+                return energy, on_sites
+            stress = voigt_6_to_full_3x3_stress(found["stress"])
+        except Exception as error:  # calculators raise anything
+            where = f"at step {state.step[NOW]}; {self._closest_atoms()}"
+            raise UserForceError(f"the calculator {self.name} raised {describe_error(error)} {where}") from error
+        arm = position - state.position[sites.molecule]
+        return energy, on_sites, -unit * state.volume * stress - on_sites.T @ arm
+
+    def _closest_atoms(self) -> str:
+        """The two atoms of different molecules that are closest, in words."""
+        owner, best, words = self._sites.molecule[self._sites.mass > 0], np.inf, "there is one molecule"
+        for k in range(len(owner) - 1):
+            others = np.flatnonzero(owner[k + 1 :] != owner[k]) + k + 1
+            if len(others) and (apart := self.atoms.get_distances(k, others, mic=True)).min() < best:
+                best, other = apart.min(), others[apart.argmin()]
+                one, two = (f"{self.atoms.symbols[i]} of molecule {owner[i] + 1}" for i in (k, other))
+                words = f"the closest atoms of different molecules, {one} and {two}, are {best:.3g} Å apart"
+        return words
 
 
 def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:

@@ -121,6 +121,8 @@ def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, a
 #: Displacements of molecules, in smallest diameters or radians, and strains of the box. A force is right if it agrees
 #: for one of them, as a pair that crosses a cutoff at which the energy jumps spoils a difference.
 STEP_FRACTIONS, STRAINS = (1e-4, 1e-5), (1e-5, 1e-6, 1e-7)
+#: If energies have random errors, the first of these times this factor is used.
+NOISY = 10.0
 #: Allowed error of a difference, as a fraction of the largest force, torque or virial of the term.
 TOLERANCE = 1e-4
 #: Rounding error of an energy, as a fraction of its size.
@@ -145,13 +147,14 @@ def _error_of_force(system: System, state: State, name: str) -> str:
     if not np.isfinite(tally.energy):
         return f"{name}: its energy at the start is {tally.energy}"
     noise = ROUNDING * max(abs(tally.energy), np.abs(load.force).sum() * system.smallest_diameter)
+    random = KJ_PER_MOL * getattr(getattr(system.python_forces.get(name), "force", None), "energy_noise", 0.0)
 
     def difference(moved: Callable[[float], State], steps: Sequence[float], given: float, size: float) -> float | None:
         found = []
-        for step in steps:
+        for step in [NOISY * steps[0]] if random else steps:
             ahead, behind = (engine.evaluate(moved(way))[1][name].energy for way in (step, -step))
             found.append((behind - ahead) / (2 * step))
-            if abs(found[-1] - given) <= TOLERANCE * max(size, abs(found[-1])) + noise / step:
+            if abs(found[-1] - given) <= TOLERANCE * max(size, abs(found[-1])) + (noise + random) / step:
                 return None
         return found[0]
 

@@ -24,6 +24,8 @@ def summary_text(summary: dict, known: Container[str] = ()) -> str:
     momentum = f"|P| = {summary['momentum_u_A_ps']:.1e} u Å/ps, {summary['momentum_relative']:.1e} of the sum of |m v|"
     rows = [("precision", summary["precision_reason"])] if summary["precision_reason"] else []
     rows += [_orthogonality(summary), ("momentum", momentum)]
+    for name, (calls, seconds) in summary.get("forces_by_python", {}).items():
+        rows.append(("forces", f"{name}: {calls} calls, {seconds:.3g} s"))
     if removed := summary["momentum_removed"]:
         rows.append(("", f"removed every {removed['interval_ps']:g} ps, {removed['energy_kJ_mol']:.1e} kJ/mol in all"))
     if summary["positions"]:

@@ -100,7 +100,9 @@ def summarise(
         "largest_orthogonality_error": float(samples["orthogonality_error"].max()), "momentum_u_A_ps": last.momentum,
         "momentum_relative": last.momentum / size if size else 0.0,
         "momentum_conserved": [axis for axis, kept in zip("xyz", system.model.keeps_momentum, strict=True) if kept],
-        "own_forces": dict(system.user_terms), "momentum_removed": removed, "stages": stages,
+        "own_forces": dict(system.user_terms),
+        "forces_by_python": {name: [f.calls, f.seconds] for name, f in system.python_forces.items()},
+        "momentum_removed": removed, "stages": stages,
         "notes": [
             *system.notes, *_common_drift_notes(system, state, last), *ewald_error_notes(system, state),
             *(note for k in moving for note in _notes_on_averages(system, samples, k)), *record.notes,

@@ -144,7 +144,7 @@ def _term(made: Any, name: str, system: "System", found: "System", tails: list[T
         found.user_terms[name] = f"{formula.text}, {len(term.group)} sites, {reach}"
         return term
     if isinstance(made, Force):
-        bound = BoundForce(made, name, system)
+        bound = BoundForce(made, name, found)
         found.python_forces[name] = bound
         found.user_terms[name] = f"{type(made).__qualname__}, computed by Python"
         return bound.term

@@ -1,5 +1,6 @@
 """Forces that users write in plain Python."""
 
+import time as clock
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -49,11 +50,13 @@ class Force:
     changes_momentum : which components of the total momentum it may change; False for forces between molecules
     tied_to_places : whether its energy depends on absolute positions, which excludes a barostat. If False, its virial
         must be the last of the returned values
+    energy_noise : random error of its energies, kJ/mol, for the comparison with its forces at the start of a run
     """
 
     name: ClassVar[str | None] = None
     changes_momentum: ClassVar[Sequence[bool]] = EVERY
     tied_to_places: ClassVar[bool] = True
+    energy_noise: ClassVar[float] = 0.0
 
     def begin(self, system: "System") -> None:
         """Called once with the system, which has `sites` (names, elements, masses, charges), `species` and `model`."""
@@ -74,19 +77,24 @@ class Force:
 
 
 class BoundForce:
-    """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on bodies."""
+    """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on bodies.
+
+    calls, seconds : how often it was called, and the time that this took
+    """
 
     def __init__(self, force: Force, name: str, system: "System"):
         self.force, self.name, self.system = force, name, system
         self._by_site = type(force).on_sites is not Force.on_sites
         if self._by_site == (type(force).on_molecules is not Force.on_molecules):
             raise UserForceError(f"the force {name} must define one of on_sites and on_molecules")
+        self.calls, self.seconds = 0, 0.0
         self._called("begin", system)
         n, turns = len(system.state.velocity), len(system.state.rotation) > 0
         self.term = PythonForces(n, turns, changes_momentum(force), bool(force.tied_to_places))
 
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
         """Fill a workspace with the forces at a state. Raises UserForceError."""
+        began = clock.perf_counter()
         state = State(*(_read_only(array) for array in state))
         if self._by_site:
             energy, force, torque, virial = self._of_sites(_read_only(self.system.site_positions(state)), state)
@@ -102,6 +110,7 @@ class BoundForce:
         workspace.tally[0] = energy * KJ_PER_MOL
         workspace.tally[1:] = KJ_PER_MOL * numbers.ravel()
         workspace.fresh[0] = 1
+        self.calls, self.seconds = self.calls + 1, self.seconds + clock.perf_counter() - began
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
         energy, force, virial, _ = self._parts(self._called("on_sites", position, state), 3)
@@ -152,6 +161,8 @@ class BoundForce:
     def _called(self, what: str, *arguments: Any) -> Any:
         try:
             return getattr(self.force, what)(*arguments)
+        except UserForceError:
+            raise
         except (Exception, SystemExit) as error:  # user code may raise anything
             trace = error.__traceback__
             while trace is not None and trace.tb_next is not None:
