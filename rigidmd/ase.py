@@ -336,7 +336,8 @@ class CalculatorForce(Force):
             on_sites[atom] = unit * np.asarray(found["forces"])
             if not self._has_virial:
                 return energy, on_sites
-            stress = voigt_6_to_full_3x3_stress(found["stress"])
+            stress = np.asarray(found["stress"])
+            stress = stress if stress.shape == (3, 3) else voigt_6_to_full_3x3_stress(stress)
         except Exception as error:  # calculators raise anything
             where = f"at step {state.step[NOW]}; {self._closest_atoms()}"
             raise UserForceError(f"the calculator {self.name} raised {describe_error(error)} {where}") from error

@@ -161,6 +161,8 @@ def _error_of_force(system: System, state: State, name: str) -> str:
     wrong = _check_molecules(system, state, load, difference)
     if not wrong and state.volume < inf and name not in system.position_dependent:
         wrong = _check_virial(state, tally.virial, max(float(np.abs(tally.virial).sum()), noise), difference)
+    if wrong and name in system.python_forces and not random:
+        wrong += ". If its energies have random errors, as in single precision, give their size: energy_noise"
     return f"{name}: {wrong}" if wrong else ""
 
 

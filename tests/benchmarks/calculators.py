@@ -1,0 +1,94 @@
+"""The error of the energy on the step, for six waters with forces of GFN2-xTB: rigid in rigidmd, flexible in ASE.
+
+    pip install tblite
+    python tests/benchmarks/calculators.py --figure rigidmd/docs/images/calculator_steps.png
+
+Both start from a minimum of their energy with momenta at 200 K, and take steps of velocity Verlet for 2 ps. The error is the
+standard deviation of the energy, divided by kT and the number of degrees of freedom (36 and 54).
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from ase import Atoms, units
+from ase.build import molecule
+from ase.md.velocitydistribution import thermalize_momenta
+from ase.md.verlet import VelocityVerlet
+from ase.optimize import LBFGS
+from tblite.ase import TBLite
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from support import INK, new_figure, open_axis
+
+from rigidmd import Simulation, scene_from_atoms
+from rigidmd.ase import CalculatorForce
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+TEMPERATURE, DURATION, INTERVAL = 200.0, 2.0, 0.012  # K, ps, ps
+THERMAL = BOLTZMANN * TEMPERATURE / KJ_PER_MOL  # kJ/mol
+RIGID, FLEXIBLE = (1.0, 2.0, 3.0, 4.0, 6.0), (0.25, 0.5, 1.0, 2.0)  # fs
+
+
+def calculator() -> TBLite:
+    return TBLite(method="GFN2-xTB", verbosity=0, accuracy=0.05)
+
+
+def rigid(atoms: Atoms, stage: dict):
+    """Results of one stage."""
+    scene = scene_from_atoms(
+        atoms, ["tip3p"], forces={"lennard_jones": False, "electrostatics": "none"}, seed=2, stages=[stage],
+        start={"temperature_K": TEMPERATURE}, output={"trajectory": False, "log_interval_ps": INTERVAL},
+    )  # fmt: skip
+    return Simulation(scene, forces=[CalculatorForce(calculator(), energy_noise_eV=1e-6)]).run(progress=False)
+
+
+def flexible(start: Atoms, step: float) -> np.ndarray:
+    """Energies, kJ/mol."""
+    atoms, energies = start.copy(), []
+    atoms.calc = calculator()
+    thermalize_momenta(atoms, TEMPERATURE, rng=np.random.default_rng(3))
+    dynamics = VelocityVerlet(atoms, step * units.fs)
+    interval = round(1000 * INTERVAL / step)
+    dynamics.attach(lambda: energies.append(atoms.get_total_energy()), interval=interval)
+    dynamics.run(round(DURATION / INTERVAL) * interval)
+    return np.array(energies) / (units.kJ / units.mol)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    cell = molecule("H2O", cell=[3.0, 3.0, 3.0]).repeat((3, 2, 1))
+    cell.set_cell(None)
+    start = rigid(cell, {"ensemble": "minimise", "force_limit_kJ_mol_A": 2.0, "torque_limit_kJ_mol": 2.0}).atoms()
+    curves = {"rigid, rigidmd": [], "flexible, ASE": []}
+    for step in RIGID:
+        results = rigid(start, {"duration_ps": DURATION, "timestep_fs": step})
+        calls, seconds = results.summary["forces_by_python"]["TBLite"]
+        curves["rigid, rigidmd"].append((step, results["drift"].std() / (36 * THERMAL)))
+        print(f"rigid    {step:5g} fs: {curves['rigid, rigidmd'][-1][1]:.2e}   {1000 * seconds / calls:.1f} ms a call")
+    relaxed = start.copy()
+    relaxed.calc = calculator()
+    LBFGS(relaxed, logfile=None).run(fmax=0.02, steps=300)
+    for step in FLEXIBLE:
+        curves["flexible, ASE"].append((step, flexible(relaxed, step).std() / (54 * THERMAL)))
+        print(f"flexible {step:5g} fs: {curves['flexible, ASE'][-1][1]:.2e}")
+    if options.figure:
+        figure = new_figure(6.4, 3.8)
+        axis = figure.subplots()
+        for (name, points), color in zip(curves.items(), ("#2b7fb8", "#c8553d"), strict=True):
+            axis.loglog(*np.array(points).T, "o-", ms=4, color=color, label=name)
+        axis.set_xlabel("time step, fs", color=INK)
+        axis.set_ylabel("error of the energy,\nkT per degree of freedom", color=INK)
+        steps = sorted({*RIGID, *FLEXIBLE})
+        axis.set_xticks(steps, [f"{step:g}" for step in steps])
+        axis.minorticks_off()
+        axis.legend(frameon=False, labelcolor=INK)
+        open_axis(axis)
+        figure.savefig(options.figure, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
