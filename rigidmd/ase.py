@@ -305,7 +305,7 @@ class CalculatorForce(Force):
         self.changes_momentum = changes_momentum  # type: ignore[misc,assignment]
 
     def begin(self, system: System) -> None:
-        """Make the atoms, and choose the properties that the calculator is asked for."""
+        """Make the atoms, and choose the properties that the calculator computes."""
         can, periodic = self.calculator.implemented_properties, bool(np.isfinite(system.state.cell).all())
         if missing := [name for name in ("energy", "forces") if name not in can]:
             raise UserForceError(f"the calculator has no {' and no '.join(missing)}")
@@ -345,14 +345,14 @@ class CalculatorForce(Force):
         return energy, on_sites, -unit * state.volume * stress - on_sites.T @ arm
 
     def _closest_atoms(self) -> str:
-        """The two atoms of different molecules that are closest, in words."""
+        """A message with the two atoms of different molecules that are closest."""
         owner, best, words = self._sites.molecule[self._sites.mass > 0], np.inf, "there is one molecule"
         for k in range(len(owner) - 1):
             others = np.flatnonzero(owner[k + 1 :] != owner[k]) + k + 1
-            if len(others) and (apart := self.atoms.get_distances(k, others, mic=True)).min() < best:
-                best, other = apart.min(), others[apart.argmin()]
+            if len(others) and (distances := self.atoms.get_distances(k, others, mic=True)).min() < best:
+                best, other = distances.min(), others[distances.argmin()]
                 one, two = (f"{self.atoms.symbols[i]} of molecule {owner[i] + 1}" for i in (k, other))
-                words = f"the closest atoms of different molecules, {one} and {two}, are {best:.3g} Å apart"
+                words = f"the closest atoms of different molecules, {one} and {two}, are at {best:.3g} Å"
         return words
 
 
