@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from rigidmd.run import Every, Moment, Observer, Results, Simulation, run_together
     from rigidmd.scene import BodyScene, MolecularScene, Scene
     from rigidmd.scene.integrators import integrator
+    from rigidmd.studies.normal_modes import normal_modes
     from rigidmd.studies.sweep.sweeping import sweep
     from rigidmd.view.plots import LivePlot
 
@@ -40,12 +41,13 @@ _HOMES = {
     "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
     "integrator": "scene.integrators",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
-    "LivePlot": "view.plots", "sweep": "studies.sweep.sweeping", "analysis": "", "view": "",
+    "LivePlot": "view.plots", "sweep": "studies.sweep.sweeping", "normal_modes": "studies.normal_modes",
+    "analysis": "", "view": "",
 }  # fmt: skip
 __all__ = [
     "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
-    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "pair_law", "resolve",
-    "run_together", "scene_from_atoms", "sweep", "trust", "view",
+    "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "normal_modes",
+    "pair_law", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
 ]  # fmt: skip
 
 PROVIDERS.append("rigidmd.view.notebook")

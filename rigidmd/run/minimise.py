@@ -126,7 +126,7 @@ class Enthalpy:
 
     def __init__(self, system: System, stage: Stage, state: State):
         self._system, self.engine = system, system.engine_of(system.terms, "double")
-        self.free, (self.rotates, self._arm) = mobile(system.model), _rotations(system, state)
+        self.free, (self.rotates, self.arm) = mobile(system.model), _rotations(system, state)
         #: Coordinate of each component of the strain; -1: none.
         self.coordinate = np.array(COUPLINGS[stage.pressure_coupling] if stage.changes_box else [-1] * 6)
         self.target = np.array(stage.pressures[0] if stage.changes_box else [0.0] * 6) * BAR
@@ -151,7 +151,7 @@ class Enthalpy:
         used = self.coordinate >= 0
         slopes = np.zeros(len(self._lengths))
         np.add.at(slopes, self.coordinate[used], volume * (self.target - pressure)[used])
-        shifts, rotations = -load.force * self.free[:, None], -load.torque_body * self.rotates / self._arm
+        shifts, rotations = -load.force * self.free[:, None], -load.torque_body * self.rotates / self.arm
         gradient = np.concatenate([shifts.ravel(), rotations.ravel(), slopes / self._lengths])
         return EnthalpyPoint(state, sum(parts), sum(map(abs, parts)), load, pressure, gradient)
 
@@ -167,7 +167,7 @@ class Enthalpy:
             found.cell[:] = state.cell @ matrix
         found.position[:] += shift
         if len(rotation):
-            found.rotation[:] = state.rotation @ from_vector(rotation / self._arm)
+            found.rotation[:] = state.rotation @ from_vector(rotation / self.arm)
         return found
 
     def gain(self, point: EnthalpyPoint, other: EnthalpyPoint, move: np.ndarray) -> float:

@@ -1,0 +1,71 @@
+"""`rigidmd modes`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from rigidmd.commands.arguments import SCENE, Options, argument, command, number, output_folder, read_scene, write_study
+
+if TYPE_CHECKING:
+    from rigidmd.studies.normal_modes import NormalModes
+
+COUNT = number(int, 1, 10**6, "a number from 1 on")
+#: Rows of the table at each end of the spectrum.
+ROWS = 8
+
+
+@command(
+    65, "normal modes of rigid molecules at a minimum of the energy: frequencies, infrared intensities, zero-point and "
+    "free energy, the longest stable step",
+    "rigidmd modes water_dimer.toml --animate 10 && rigidmd view runs/water_dimer-modes", *SCENE,
+    argument("--no-minimise", action="store_true", help="require that the start is a minimum"),
+    argument("--count", type=COUNT, metavar="N",
+        help="only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are more than 6000)"),
+    argument("--animate", type=COUNT, metavar="K", help="also write mode K as a run, for `view` and `film`"),
+    *output_folder("runs/NAME-modes"), writes=True,
+)  # fmt: skip
+def _modes(options: Options) -> int:
+    from rigidmd.studies.normal_modes import FILE, animation_files, normal_modes, write_animation
+
+    scene, begin = read_scene(options), perf_counter()
+    names = (FILE, *(animation_files(scene) if options.animate else []))
+
+    def write(folder: Path, found: "NormalModes", command: str) -> list[Path]:
+        found.table().write(folder / FILE)
+        if options.animate:
+            write_animation(folder, found, options.animate)
+        return [folder / name for name in names]
+
+    write_study(
+        Path(options.output or f"runs/{scene.name}-modes"), options.force, names, "minimising",
+        lambda progress: normal_modes(scene, minimise=not options.no_minimise, count=options.count, progress=progress),
+        lambda found: [*_describe(found), f"  {perf_counter() - begin:.3g} s"], write,
+    )  # fmt: skip
+    return 0
+
+
+def _describe(found: "NormalModes") -> Iterator[str]:
+    table, at, total, last = found.table(), found.wavenumber, len(found.coordinates.index), len(found.rate) - 1
+    unstable, warm = at[found.rate < 0], found.temperature
+    is_whole = len(at) == total
+    yield f"{found.system.scene.name}: normal modes at a minimum of {found.energy:.8g} kJ/mol"
+    why = f" ({found.ended})" if found.ended else ""
+    yield f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e} kJ/mol{why}"
+    yield f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)} unstable modes"
+    for kind in ("translation", "libration"):
+        if len(of := [x for k, x in enumerate(at) if x > 0 and found.kind(k) == kind]):
+            yield f"  {kind}s: {len(of)}, from {of[0]:.4g} to {of[-1]:.4g} cm⁻¹"
+    if len(unstable):
+        yield f"  unstable: {', '.join(f'{x:.4g}' for x in unstable[:ROWS])} cm⁻¹: a saddle point, not a minimum"
+    if is_whole:
+        yield f"  zero-point energy of the rigid model {found.free_energy(0):.6g} kJ/mol"
+    if is_whole and warm:
+        quantum, classical = found.free_energy(warm), found.free_energy(warm, quantum=False)
+        yield f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical {classical:.6g} kJ/mol"
+    yield (
+        f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by mode {total}, a "
+        f"{found.kind(last)}, {found.weight[last].max():.0%} of it in {table.values(last)[-1]}"
+    )
+    shown = [k for k in table.rows if k < ROWS or k > last - ROWS]
+    yield "\n" + table._replace(rows=shown).text()

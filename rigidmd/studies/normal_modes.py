@@ -1,0 +1,286 @@
+"""Normal modes of rigid molecules: their small vibrations about a minimum of the energy.
+
+The coordinates are q = (sqrt(m) X, sqrt(I_k) theta_k), with X in the lab frame and theta_k about principal axes. The
+Hessian in them has the eigenvalues w² (Goldstein, Classical Mechanics, chapter 6). It is made of central differences of
+the compiled forces and torques, in double precision. The guide `normal_modes` has the equations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from rigidmd.core.state import NOW, State
+from rigidmd.engines.observables import observe
+from rigidmd.engines.system import System
+from rigidmd.errors import SceneError, SimulationError
+from rigidmd.io.folder import LOG, SCENE, SUMMARY
+from rigidmd.io.run_files import Log
+from rigidmd.io.scene_file import input_names, write_scene
+from rigidmd.io.write import Column, Table, write_json
+from rigidmd.run import Simulation
+from rigidmd.run.checks import molecule_label
+from rigidmd.run.minimise import Enthalpy
+from rigidmd.run.minimise import minimise as find_minimum
+from rigidmd.run.pilot.stable_step import stiffest_mode
+from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.stage import Stage
+from rigidmd.units import AVOGADRO, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
+
+#: Displacement of a difference, in smallest diameters: its error and that of rounding are 1e-10 of the largest entry.
+DISPLACEMENT = 3e-6
+#: Largest force after the minimisation, and largest one that is accepted as a minimum: fractions of the force with
+#: which the stiffest motion opposes a displacement by the smallest diameter. Torques: these forces at a lever of 1 Å.
+TIGHT, ACCEPTED = 1e-13, 1e-6
+#: A mode with a smaller |w²|, as a fraction of the largest, is a zero mode.
+ZERO = 1e-8
+#: Largest error of w² as a fraction of the largest: beyond it forces jump where a pair passes the cutoff.
+LARGEST_ERROR = 1e-4
+SMOOTH = (
+    "where forces jump at the cutoff, --set forces.truncation=smooth_switch, and with PME or Ewald sums also --set "
+    "forces.ewald_accuracy=1e-7, make them smooth"
+)
+#: Most coordinates of a complete spectrum by default: a matrix of them has 0.3 GB. Modes at each end beyond it.
+MOST_DENSE, COUNT = 6000, 20
+#: Residual of Lanczos vectors as a fraction of the largest w², and least dimension of their Krylov space.
+RESIDUAL, KRYLOV = 1e-9, 80
+#: Largest displacement in an animation, Å; its periods, and the frames of each.
+AMPLITUDE, PERIODS, FRAMES = 0.5, 2, 48
+
+FILE = "modes.csv"
+PER_CM = 1e10 / 299792458 / (2 * pi)  # wavenumber (cm⁻¹) of 1 rad/ps
+HBAR = 6.62607015e-34 / (2 * pi) * AVOGADRO * KJ_PER_MOL * 1e9  # u Å²/ps
+#: Intensity (km/mol) of a squared derivative of the dipole of 1 e²/u: N_A/(12 epsilon_0 c²).
+INTENSITY = pi * AVOGADRO / 3 * COULOMB * 1e-9 / 299792458**2
+
+
+class Coordinates:
+    """The mass-weighted coordinates q (d,) about a state. Frozen molecules and axes without inertia have none.
+
+    scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
+    index : (d,) of each coordinate among the components of such a move: shifts (3 n), then rotations
+    translations : (t, d) unit vectors of uniform translations along which the total momentum is conserved
+    """
+
+    def __init__(self, system: System, state: State):
+        self.enthalpy, self.state = Enthalpy(system, Stage(ensemble="minimise"), state), state
+        model, species = system.model, system.model.species
+        rotations = np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
+        self._all = np.concatenate([np.repeat(np.sqrt(model.inverse_mass[species]), 3), rotations.ravel()])
+        self.index = np.flatnonzero(self._all)
+        self.scale, self._step = self._all[self.index], DISPLACEMENT * system.smallest_diameter
+        self.is_shift = self.index < state.position.size
+        uniform = [self.is_shift * (self.index % 3 == k) / self.scale for k in np.flatnonzero(model.keeps_momentum)]
+        self.translations = np.array([q / np.linalg.norm(q) for q in uniform]).reshape(-1, len(self.index))
+
+    def at(self, q: np.ndarray) -> State:
+        """The state at a displacement q (d,)."""
+        move = np.zeros_like(self._all)
+        move[self.index] = self.scale * q
+        return self.enthalpy.moved(self.state, move)
+
+    def slope(self, q: np.ndarray, function: Callable[[State], np.ndarray]) -> np.ndarray:
+        """The derivative of a function of the state along q (d,), by a central difference."""
+        h = self._step / (np.abs(self.scale * q).max() or 1.0)
+        return (function(self.at(h * q)) - function(self.at(-h * q))) / (2 * h)
+
+    def relative(self, q: np.ndarray) -> np.ndarray:
+        """A displacement (d,) without its uniform translation."""
+        return q - (self.translations @ q) @ self.translations
+
+    def curvature(self, q: np.ndarray) -> np.ndarray:
+        """The Hessian times q (d,), without the forces on uniform translations that errors of meshes make."""
+        gradient = self.slope(self.relative(q), lambda state: self.enthalpy.at(state).gradient)
+        return self.relative(self.scale * gradient[self.index])
+
+
+@dataclass(frozen=True, eq=False)
+class NormalModes:
+    """Modes, k of d, by ascending w²; see `normal_modes`."""
+
+    system: System
+    coordinates: Coordinates  # about the minimum, which is `coordinates.state`
+    energy: float  # of the minimum, kJ/mol
+    force: float  # largest at the minimum, kJ/(mol Å)
+    torque: float  # largest at the minimum, kJ/mol
+    ended: str  # why the minimisation stopped before the rounding of forces, if it did
+    temperature: float  # of the scene, K; 0 if it has none
+    longest_step_fs: float  # the longest stable step of velocity Verlet, 2/w of the last mode
+    number: np.ndarray  # (k,) of each mode among all d, from 1
+    rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
+    wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
+    error: np.ndarray  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
+    vector: np.ndarray  # (k, d) unit vectors in the mass-weighted coordinates
+    translation: np.ndarray  # (k,) fraction of the kinetic energy that is of translation, not of libration
+    weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
+    intensity: np.ndarray  # (k,) infrared, km/mol, from the derivative of the dipole of the charges
+
+    def free_energy(self, temperature: float, quantum: bool = True) -> float:
+        """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of the minimum on, at a
+        temperature (K); at 0 the zero-point energy. Raises ValueError if there are only some of the modes."""
+        if len(self.rate) < len(self.coordinates.index):
+            raise ValueError("a sum over all modes needs all of them: leave out count")
+        quanta, thermal = HBAR * self.rate[self.rate > 0], BOLTZMANN * temperature
+        with np.errstate(divide="ignore"):
+            x = quanta / thermal
+        terms = quanta / 2 + thermal * np.log(-np.expm1(-x)) if quantum else thermal * np.log(x)
+        return float(terms.sum() / KJ_PER_MOL)
+
+    def kind(self, k: int) -> str:
+        return "zero" if self.rate[k] == 0 else "translation" if self.translation[k] >= 0.5 else "libration"
+
+    def table(self) -> Table:
+        """The modes with their properties; zero modes, which mix freely, have none."""
+
+        def of(values: np.ndarray) -> Callable[[int], float | None]:
+            return lambda k: float(values[k]) if self.rate[k] else None
+
+        return Table([
+            Column("mode", lambda k: str(self.number[k])), Column("kind", self.kind),
+            Column("wavenumber (cm^-1)", lambda k: float(self.wavenumber[k]), "cm⁻¹"),
+            Column("error (cm^-1)", of(self.error), "±"),
+            Column("frequency (1/ps)", lambda k: float(self.rate[k] / (2 * pi)), "1/ps"),
+            Column("translation", of(self.translation)),
+            Column("participation", of(1 / (self.weight**2).sum(axis=1)), "molecules"),
+            Column("IR intensity (km/mol)", of(self.intensity), "IR (km/mol)"),
+            Column("largest in", lambda k: molecule_label(self.system, int(self.weight[k].argmax()))),
+        ], range(len(self.rate)))  # fmt: skip
+
+
+def normal_modes(
+    scene: MolecularScene | BodyScene | Simulation, *, minimise: bool = True, count: int | None = None,
+    progress: Callable[[float], object] = lambda fraction: None,
+) -> NormalModes:  # fmt: skip
+    """Normal modes about the minimum next to the start of a scene, or next to the present state of a simulation.
+
+    modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
+    print(modes.wavenumber, modes.free_energy(300.0), modes.longest_step_fs)
+
+    A minimisation comes first, to the rounding of forces and torques and at constant cell.
+
+    minimise : False requires that the start is a minimum; count : of the lowest and of the highest modes, by Lanczos
+    (default: all, or 20 if there are more than 6000); progress : called with the fraction done
+    Raises SceneError for a single body, SimulationError where a minimum is required and not found.
+    """
+    simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
+    if isinstance(simulation.scene, BodyScene):
+        raise SceneError(simulation.scene.source, ["normal modes are of molecules, and this is a single body"])
+    state, system = (simulation.state if simulation is scene else simulation.settle()).copy(), simulation.system
+    sizes = _find_minimum(system, state, minimise)
+    c, charges = Coordinates(system, state), system.of_sites(lambda m: m.charges)
+    d, fixed, temperature = len(c.index), len(c.translations), simulation.scene.start.temperature_K or 0.0
+    for stage in simulation.scene.stages:
+        temperature = stage.temperatures[1] or temperature
+    count = COUNT if count is None and d > MOST_DENSE else count
+    if count is None or 2 * count + fixed >= d:
+        (square, vector, error), number = _all_modes(c, progress), np.arange(1, d + 1)
+    else:
+        (square, vector, error), number = _outer_modes(c, count), np.r_[1 : count + fixed + 1, d - count + 1 : d + 1]
+    if not error.max() <= LARGEST_ERROR * square[-1]:
+        raise SimulationError(
+            f"forces are not smooth at the minimum: w² are uncertain by {error.max():.1e}/ps²; {SMOOTH}"
+        )
+    signed = np.where(np.abs(square) > ZERO * square[-1], np.sign(square) * np.sqrt(np.abs(square)), np.nan)
+    rate, weight = np.nan_to_num(signed), np.zeros((len(state.position), len(square)))
+    np.add.at(weight, c.index // 3 % len(weight), vector.T**2)
+    slopes = np.array([c.slope(q, lambda state: charges @ system.site_positions(state)) for q in vector])
+    return NormalModes(
+        system, c, *sizes, temperature, 2 / rate[-1] / FEMTOSECOND,
+        number, rate, PER_CM * rate, PER_CM * error / np.abs(2 * signed),
+        vector, vector**2 @ c.is_shift, weight.T, INTENSITY * (slopes**2).sum(axis=1),
+    )  # fmt: skip
+
+
+def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, float, float, str]:
+    """Move a state to a minimum, in place, or check that it is one: energy, largest force and torque (kJ/mol, Å), and
+    why the minimisation stopped before the rounding of forces, if it did."""
+    loose = Stage(ensemble="minimise")
+    enthalpy, keys, ended = Enthalpy(system, loose, state), ("force_limit_kJ_mol_A", "torque_limit_kJ_mol"), ""
+    if minimise:
+        find_minimum(system, state, loose)
+    fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
+    if fastest is None:
+        raise SimulationError("no force holds these molecules at their positions: they have no normal modes")
+    mass = float(system.model.mass[system.model.species[enthalpy.free]].min())
+    stiff = fastest.rate**2 * mass * system.smallest_diameter / KJ_PER_MOL
+    for fraction in (ACCEPTED, TIGHT) if minimise else ():
+        tight = loose.model_copy(update=dict.fromkeys(keys, fraction * stiff))
+        if ended := find_minimum(system, state, tight).ended_by:
+            break
+    point = enthalpy.at(state)
+    force, torque = (size / KJ_PER_MOL for size in enthalpy.largest(point)[:2])
+    if max(force, torque) <= ACCEPTED * stiff:
+        return point.energy / KJ_PER_MOL, force, torque, ended
+    stage = f"a stage ensemble = 'minimise' with {' and '.join(keys)} = {ACCEPTED * stiff:.1g}"
+    why = f"the minimisation ended there ({ended}); {SMOOTH}"
+    advice = why if minimise else f"leave out --no-minimise, or begin with {stage}"
+    raise SimulationError(
+        f"this is not a minimum of the energy: the largest force is {force:.3g} kJ/(mol Å), the largest torque "
+        f"{torque:.3g} kJ/mol; {advice}"
+    )
+
+
+def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """w² (d,), modes (d, d) and the error of w² (d,) by the asymmetry of the Hessian."""
+    hessian = np.eye(len(c.index))
+    for k, unit in enumerate(hessian):
+        hessian[k] = c.curvature(unit)
+        progress((k + 1) / len(hessian))
+    square, vector = np.linalg.eigh((hessian + hessian.T) / 2)
+    return square, vector.T, np.full(len(square), np.abs(hessian - hessian.T).max())
+
+
+def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of uniform translations and of the lowest and highest modes, by Lanczos; errors by residuals."""
+    shape, size = (len(c.index),) * 2, min(len(c.index), max(2 * count + 1, KRYLOV))
+    start = c.relative(np.random.default_rng(0).standard_normal(len(c.index)))
+
+    def largest(product: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        operator = LinearOperator(shape, matvec=product, dtype=float)  # pyright: ignore[reportCallIssue]
+        tolerance: Any = RESIDUAL  # the types in SciPy require an integer
+        return eigsh(operator, count, which="LA", ncv=size, tol=tolerance, v0=start)[1].T
+
+    high = largest(c.curvature)
+    top = max(q @ c.curvature(q) for q in high)
+    low = largest(lambda q: c.relative(top * q) - c.curvature(q))  # w² near 0 would converge to a fraction of itself
+    vector = np.concatenate([c.translations, low, high])
+    image = np.concatenate([0 * c.translations, [c.curvature(q) for q in (*low, *high)]])
+    square = (vector * image).sum(axis=1)
+    order = square.argsort(kind="stable")
+    return square[order], vector[order], np.linalg.norm(image - square[:, None] * vector, axis=1)[order]
+
+
+def animation_files(scene: MolecularScene | BodyScene) -> list[str]:
+    """Names of the files of `write_animation`. Raises SceneError without a trajectory."""
+    output = scene.output
+    if not output.trajectory:
+        raise SceneError(scene.source, ["an animation needs a trajectory, and output.trajectory is false"])
+    return [SCENE, *input_names(scene).values(), str(output.topology), output.trajectory, LOG, SUMMARY]
+
+
+def write_animation(folder: Path, found: NormalModes, number: int) -> None:
+    """Write the harmonic motion along a mode, at rest in each frame, with its energies, as a run for `view`."""
+    from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
+
+    c, system, scene, output = found.coordinates, found.system, found.system.scene, found.system.scene.output
+    k = int(np.searchsorted(found.number, number))
+    if not (k < len(found.rate) and found.number[k] == number and found.rate[k]):
+        raise SceneError(scene.source, [f"mode {number} is not a vibration that was computed, and has no animation"])
+    period, q = 2 * pi / abs(found.rate[k]), AMPLITUDE / np.abs(c.scale * found.vector[k]).max() * found.vector[k]
+    write_scene(folder, scene)
+    write_topology(folder / output.topology, system, c.state, False)
+    log = Log(folder / LOG, False, None, tuple(system.user_terms))
+    frames = open_trajectory(folder / str(output.trajectory), system, period / FRAMES, False, False)
+    for step in range(PERIODS * FRAMES + 1):
+        state, time = c.at(np.cos(2 * pi * step / FRAMES) * q), period * step / FRAMES
+        state.velocity[:], state.angular_momentum_body[:], state.time[NOW], state.step[NOW] = 0, 0, time, step
+        frames.write(state, time, step)
+        log.write(observe(system, c.enthalpy.engine, state, len(scene.stages) - 1).sample)
+    frames.close()
+    log.close()
+    note = f"mode {number}, {found.wavenumber[k]:.4g} cm⁻¹: harmonic motion by up to {AMPLITUDE:g} Å, not a run"
+    write_json(folder / SUMMARY, {"notes": [note]})
