@@ -47,25 +47,26 @@ def _modes(options: Options) -> int:
 
 def _describe(found: "NormalModes") -> Iterator[str]:
     table, at, total, last = found.table(), found.wavenumber, len(found.coordinates.index), len(found.rate) - 1
-    unstable, warm = at[found.rate < 0], found.temperature
-    is_whole = len(at) == total
-    yield f"{found.system.scene.name}: normal modes at a minimum of {found.energy:.8g} kJ/mol"
+    unstable, warm, is_whole = at[found.rate < 0], found.temperature, len(at) == total
+    point = "a saddle point" if len(unstable) else "a minimum"
+    yield f"{found.system.scene.name}: normal modes at {point} of the energy, {found.energy:.8g} kJ/mol"
     why = f" ({found.ended})" if found.ended else ""
     yield f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e} kJ/mol{why}"
     yield f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)} unstable modes"
+    if len(unstable):
+        yield f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹; displace the molecules and repeat"
     for kind in ("translation", "libration"):
         if len(of := [x for k, x in enumerate(at) if x > 0 and found.kind(k) == kind]):
             yield f"  {kind}s: {len(of)}, from {of[0]:.4g} to {of[-1]:.4g} cm⁻¹"
-    if len(unstable):
-        yield f"  unstable: {', '.join(f'{x:.4g}' for x in unstable[:ROWS])} cm⁻¹: a saddle point, not a minimum"
     if is_whole:
         yield f"  zero-point energy of the rigid model {found.free_energy(0):.6g} kJ/mol"
     if is_whole and warm:
         quantum, classical = found.free_energy(warm), found.free_energy(warm, quantum=False)
         yield f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical {classical:.6g} kJ/mol"
+    _, kind, *_, part, _, where = table.values(last)
     yield (
-        f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by mode {total}, a "
-        f"{found.kind(last)}, {found.weight[last].max():.0%} of it in {table.values(last)[-1]}"
+        f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by mode {total}: {kind} of "
+        f"{part:.3g} molecules, largest in {where}"
     )
     shown = [k for k in table.rows if k < ROWS or k > last - ROWS]
     yield "\n" + table._replace(rows=shown).text()

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
@@ -49,7 +48,7 @@ MOST_DENSE, COUNT = 6000, 20
 #: Residual of Lanczos vectors as a fraction of the largest w², and least dimension of their Krylov space.
 RESIDUAL, KRYLOV = 1e-9, 80
 #: Largest displacement in an animation, Å; its periods, and the frames of each.
-AMPLITUDE, PERIODS, FRAMES = 0.5, 2, 48
+AMPLITUDE, PERIODS, FRAMES = 0.3, 2, 48
 
 FILE = "modes.csv"
 PER_CM = 1e10 / 299792458 / (2 * pi)  # wavenumber (cm⁻¹) of 1 rad/ps
@@ -241,8 +240,7 @@ def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np
 
     def largest(product: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         operator = LinearOperator(shape, matvec=product, dtype=float)  # pyright: ignore[reportCallIssue]
-        tolerance: Any = RESIDUAL  # the types in SciPy require an integer
-        return eigsh(operator, count, which="LA", ncv=size, tol=tolerance, v0=start)[1].T
+        return eigsh(operator, count, which="LA", ncv=size, tol=RESIDUAL, v0=start)[1].T  # pyright: ignore
 
     high = largest(c.curvature)
     top = max(q @ c.curvature(q) for q in high)
