@@ -113,6 +113,17 @@ def test_a_crystal_of_argon_is_that_of_lattice_dynamics():
     assert found.error[-1] < 1e-6 * found.wavenumber[-1]
 
 
+def test_forces_that_jump_at_the_minimum_are_refused():
+    """A shell of neighbours at the cutoff, less than a displacement inside. Its Hessian is symmetric, and wrong."""
+    a = 5.31
+    corners = a * np.array(list(np.ndindex(3, 3, 3)))
+    basis = a / 2 * np.array([[0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0]])
+    state = state_of((corners[:, None] + basis).reshape(-1, 3), cell=3 * a * np.eye(3))
+    scene = small_scene({"argon": 108}, 3 * a, forces={"cutoff_A": a * np.sqrt(2) * (1 + 1e-8), "truncation": "shift"})
+    with pytest.raises(SimulationError, match=r"forces are not smooth.*truncation=smooth_switch"):
+        modes_from(scene, state, minimise=False)
+
+
 def dimer_energy(state):
     """Energy (u Å²/ps²) of two SPC/E waters displaced by moves (12, ...): shifts and rotation vectors, in NumPy."""
     water = load_model("spce")

@@ -224,13 +224,15 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
 
 
 def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w² (d,), modes (d, d) and the error of w² (d,) by the asymmetry of the Hessian."""
+    """w² (d,), modes (d, d) and the error of w² (d,): the asymmetry of the Hessian, or its error on a vector."""
     hessian = np.eye(len(c.index))
     for k, unit in enumerate(hessian):
         hessian[k] = c.curvature(unit)
         progress((k + 1) / len(hessian))
+    q = np.random.default_rng(0).standard_normal(len(hessian))
+    error = np.linalg.norm(hessian @ q - c.curvature(q)) / np.linalg.norm(q)
     square, vector = np.linalg.eigh((hessian + hessian.T) / 2)
-    return square, vector.T, np.full(len(square), np.abs(hessian - hessian.T).max())
+    return square, vector.T, np.full(len(square), max(error, np.abs(hessian - hessian.T).max()))
 
 
 def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
