@@ -13,6 +13,7 @@ from rigidmd.core.state import State
 from rigidmd.dynamics.model import Model, draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
 from rigidmd.errors import SceneError, StructureError
+from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.io.formats.cells import cell_error, pairs_within
@@ -28,7 +29,22 @@ if TYPE_CHECKING:
 
 
 def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
-    """Positions and orientations from the structure file, or on a lattice. Raises SceneError, StructureError."""
+    """Positions and orientations from the structure file, or on a lattice, with the vacuum of the scene. Raises
+    SceneError, StructureError."""
+    found = _without_vacuum(scene, species)
+    if (length := scene.box.vacuum_A) is None or found.cell is None:
+        return found
+    if not np.array_equal(found.basis, SAME_BASIS):
+        raise SceneError(scene.source, ["box.vacuum_A: the cell has a large tilt; give an equivalent cell without"])
+    k, cell = "xyz".index(scene.box.vacuum_axis), found.cell.copy()
+    added = length / np.linalg.norm(cell[k]) * cell[k]
+    images = np.floor(found.position @ np.linalg.inv(cell)[:, k])
+    position = found.position - images[:, None] * cell[k] + 0.5 * added
+    cell[k] += added
+    return found._replace(position=position, cell=cell)
+
+
+def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configuration:
     if scene.structure is not None:
         start, content = scene.structure, scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if content is None else Path(start.file)

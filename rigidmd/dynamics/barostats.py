@@ -26,6 +26,8 @@ COUPLINGS = {
     "semi_isotropic": (0, 0, 1, -1, -1, -1),
     "anisotropic": (0, 1, 2, -1, -1, -1),
     "flexible": (0, 1, 2, 3, 4, 5),
+    "normal": (-1, -1, 0, -1, -1, -1),
+    "lateral": (0, 0, -1, -1, -1, -1),
 }
 #: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
 WIDTH = 2.0

@@ -128,7 +128,7 @@ def unknown_terms(system: System) -> Iterator[str]:
         if name not in system.user_terms:
             what = "a field" if hasattr(term, "changes_momentum") else f"the term {kind.__name__}"
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
-            what = "forces.ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
+            what = "forces.ewald_slab or ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
         if name in system.user_terms or kind not in DESCRIBED:
             yield f"{name.replace('_', ' ')}: {what} is left to rigidmd"
     if system.thermostat is not None:

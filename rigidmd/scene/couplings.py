@@ -12,7 +12,7 @@ from rigidmd.scene.validation import NameIn, Number, Positive, Section
 
 Values = dict[str, float]  # of keys
 Six = tuple[float, float, float, float, float, float]
-Shapes = Literal["isotropic", "semi_isotropic", "anisotropic", "flexible"]
+Shapes = Literal["isotropic", "semi_isotropic", "anisotropic", "flexible", "normal", "lateral"]
 
 BAROSTAT_TIME = 1.0  # ps
 #: Moves of the box per barostat_time_ps.
@@ -142,7 +142,7 @@ class BarostatKeys(Section):
     [1, 1000]; three for one along each axis; six for the tensor xx, yy, zz, xy, xz, yz"""
     pressure_coupling: Shapes = "isotropic"
     """How the box changes: isotropic keeps its shape; semi_isotropic: x and y together, z separately; anisotropic:
-    three edges; flexible: edges and angles"""
+    three edges; flexible: edges and angles; normal: z alone, at constant area; lateral: x and y together, z is kept"""
     barostat: Annotated[str, NameIn(BAROSTATS)] | None = Field(
         default=None,
         description="; ".join(f"{name}, of {kind.ensembles[0]}: {kind.summary}" for name, kind in BAROSTATS.items())

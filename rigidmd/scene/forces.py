@@ -25,7 +25,14 @@ class Method(NamedTuple):
     conserves_momentum: bool = True
 
 
-_EWALD = ("ewald_accuracy", "ewald_cutoff_A", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_truncation")
+_EWALD = (
+    "ewald_accuracy",
+    "ewald_cutoff_A",
+    "ewald_alpha_per_A",
+    "ewald_surface_permittivity",
+    "ewald_slab",
+    "ewald_truncation",
+)
 _K_VECTORS = ("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")
 #: Value of `electrostatics` -> the method.
 ELECTROSTATICS = {
@@ -167,6 +174,8 @@ class Forces(Section):
     -erfc(alpha R)/(2 R) times the square of each molecule's charge with the cutoff R, which is 0 for neutral ones"""
     ewald_surface_permittivity: Permittivity = inf
     """Permittivity around the periodic images as a whole; inf, a conductor, adds no surface term"""
+    ewald_slab: Literal["x", "y", "z"] | None = None
+    """With ewald and pme: the normal of a slab between empty parts of the box; images along it then do not act"""
     pme_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
     """With pme: order of the B-splines; 4 is cubic"""
     pme_grid: tuple[GridSize, GridSize, GridSize] | None = None
@@ -183,6 +192,8 @@ class Forces(Section):
             yield "ewald_k2_max needs ewald_k_max too"
         if self.ewald_k2_max is not None and self.ewald_k_radius_per_A is not None:
             yield "give ewald_k2_max or ewald_k_radius_per_A, not both"
+        if self.ewald_slab is not None and self.ewald_surface_permittivity < inf:
+            yield "give ewald_slab or ewald_surface_permittivity, not both"
         determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"

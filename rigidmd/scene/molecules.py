@@ -262,6 +262,8 @@ class MolecularScene(Scene):
             yield "box.density_g_cm3 and a structure file contradict each other: omit one"
         elif self.structure.repeat != (1, 1, 1) and (self.box.lengths_A is not None or not self.box.periodic):
             yield "structure.repeat repeats the file's cell: omit box.lengths_A and periodic = false"
+        if self.box.vacuum_A and self.box.vacuum_axis in [walls.axis for walls in self.fields.walls]:
+            yield "box.vacuum_A and fields.walls across the same axis contradict each other: omit one"
         first, from_file = self.first_moving, self.structure is not None and self.structure.velocities
         if self.start.temperature_K is None and first is not None and first.temperature_K is None and not from_file:
             which = "the first stage" if first is self.stages[0] else "the first stage that is not a minimisation"
@@ -276,6 +278,12 @@ class MolecularScene(Scene):
             "fields.walls do not move: keep the volume": self.fields.walls,
             "fields.restraints fix positions: keep the volume": self.fields.restraints,
         }
+        if (slab := self.forces.ewald_slab) is not None:
+            rigid = {"lateral"} if slab == "z" else set()
+            why = f"forces.ewald_slab = {slab!r} needs a constant edge along {slab}: keep the volume"
+            why += ", or set pressure_coupling = 'lateral'" if rigid else ""
+            moving = [k for k, s in enumerate(self.stages) if s.changes_box and s.pressure_coupling not in rigid]
+            yield from [f"stages.{k}: {why}" for k in moving]
         for k, stage in enumerate(self.stages):
             what = f"stages.{k}: {stage.ensemble}{' with pressure_bar' * stage.is_minimisation} changes the box"
             yield from [f"{what}, but {why}" for why, applies in reasons.items() if stage.changes_box and applies]

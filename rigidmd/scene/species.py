@@ -143,6 +143,10 @@ class Box(Section):
     """Angles between b and c, c and a, a and b; default: right angles"""
     density_g_cm3: Positive | None = None
     """Mass density, which sets the edge of a cube"""
+    vacuum_A: Positive | None = None
+    """Empty length that is added to an edge, half on each side of the molecules: a slab"""
+    vacuum_axis: Literal["x", "y", "z"] = "z"
+    """The edge a, b or c to which vacuum_A is added"""
     periodic: Flag = True
     """Periodic boundary conditions; false: molecules in vacuum without a box"""
 
@@ -151,6 +155,8 @@ class Box(Section):
             yield "give lengths_A or density_g_cm3, not both"
         if self.angles_deg is not None and self.lengths_A is None:
             yield "angles_deg needs lengths_A"
+        if self.vacuum_A is not None and not self.periodic:
+            yield "vacuum_A would do nothing: periodic is false"
         angles = [radians(angle) for angle in self.angles_deg or (90, 90, 90)]
         if not 2 * max(angles) < sum(angles) < 2 * pi:  # the edges would be in one plane, or could not meet
             yield "angles_deg: three edges cannot form these angles"

@@ -186,7 +186,9 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         unequal = coupling == "semi_isotropic" and isinstance(given, tuple) and several == 3 and given[0] != given[1]
         if unequal or (coupling == "isotropic" and several == 3):
             yield f"pressure_bar: these three need pressure_coupling = 'anisotropic', not {coupling!r}"
-        if several == 6 and coupling != "flexible":
+        if several in (3, 6) and coupling in ("normal", "lateral"):
+            yield f"pressure_bar: pressure_coupling = {coupling!r} has one pressure"
+        elif several == 6 and coupling != "flexible":
             yield f"pressure_bar: a tensor needs pressure_coupling = 'flexible', not {coupling!r}"
 
     def _barostat_errors(self):

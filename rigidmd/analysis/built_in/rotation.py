@@ -248,6 +248,8 @@ def dielectric(frames: RigidFrames) -> AnalysisResult:
         raise OutputError("a dielectric constant needs molecules with charges")
     if frames.system.scene.fields.electric_V_per_nm is not None:
         raise OutputError("an electric field acts: the fluctuation of the dipole gives no dielectric constant there")
+    if forces.ewald_slab:
+        raise OutputError("a slab has no dielectric constant: leave forces.ewald_slab out, in a box without vacuum")
     if forces.electrostatics in ("ewald", "pme"):
         around = forces.ewald_surface_permittivity
     elif forces.electrostatics == "reaction_field":

@@ -37,9 +37,13 @@ def _add_background(term, state, load, tally):
 
 
 class SurfaceDipole(NamedTuple):
-    """Response of the medium around a large sphere of boxes to its dipole: energy 2 pi/((2 eps + 1) V) |sum q r|²."""
+    """Response of the surroundings of all images to their dipole M = sum q r: energy sum_k strength_k M_k² / V.
 
-    strength: float  # 2 pi/(2 eps + 1)
+    A medium around a large sphere of boxes has the strength 2 pi/(2 eps + 1) along each axis. A slab in vacuum has 2 pi
+    along its normal (Yeh & Berkowitz 1999, J. Chem. Phys. 111, 3155, eq. 10), which leaves the field of a single slab.
+    """
+
+    strength: tuple[float, float, float]
     charge: np.ndarray  # (s,) sum to 0, in units where q²/r is an energy in u Å²/ps²
     sites: BodySites | CentralSites
 
@@ -50,7 +54,7 @@ class SurfaceDipole(NamedTuple):
 
 
 class SurfaceWorkspace(NamedTuple):
-    strength: float
+    strength: tuple[float, float, float]
     charge: np.ndarray
     sites: BodySites | CentralSites
     position: np.ndarray  # (s, 3)
@@ -60,10 +64,9 @@ class SurfaceWorkspace(NamedTuple):
 @implements(terms.add_forces, SurfaceWorkspace)
 def _add_surface_dipole(term, state, load, tally):
     compute_site_positions(term.sites, state, term.position)
-    per_dipole_square = term.strength / volume_of(state.cell)
-    energy = 0.0
+    volume, energy = volume_of(state.cell), 0.0
     for k in range(3):
-        dipole = 0.0
+        dipole, per_dipole_square = 0.0, term.strength[k] / volume
         for i in range(len(term.charge)):
             dipole += term.charge[i] * term.position[i, k]
         for i in range(len(term.charge)):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
@@ -28,6 +29,8 @@ MOST_K_VECTORS = 1000
 MOST_K_VECTORS_IN_ALL = 2e7  # with which a step with 1000 sites takes half a minute
 #: A net charge below this fraction of the sum of |q| is rounding.
 NEUTRAL = 1e-10
+#: Least empty part of the box along the normal of a slab, as a fraction of the longest edge across.
+LEAST_VACUUM = 0.5
 #: Largest error of the polynomials in single precision between unit charges, as a fraction of the real-space error.
 #: With it the measured error of PME on 4096 waters, 3.3e-5 e²/Å², is the same as with all terms of the polynomials.
 FIT_ERROR_FRACTION = 0.02
@@ -182,16 +185,59 @@ def interactions(parts: SystemParts) -> Interactions:
             f"the box has a net charge of {charge_e.sum():+.6g} e; an even background of the opposite charge "
             "makes it neutral, and energies and pressure depend on the size of the box"
         )
-    if (permittivity := forces.ewald_surface_permittivity) < inf:
+    if any(strength := _surface_strength(forces)):
+        key = "ewald_slab" if forces.ewald_slab else "ewald_surface_permittivity"
         if not neutral:
             why = "the dipole of a box with a net charge is not defined; leave it out"
-            raise SceneError(parts.scene.source, [f"forces.ewald_surface_permittivity: {why}"])
-        terms["coulomb_surface"] = corrections.SurfaceDipole(2 * pi / (2 * permittivity + 1), charge, sites)
+            raise SceneError(parts.scene.source, [f"forces.{key}: {why}"])
+        terms["coulomb_surface"] = corrections.SurfaceDipole(strength, charge, sites)
+        if forces.ewald_slab:
+            notes.append(_checked_slab(parts, sites, charge))
     pressure = 0.0
     if frozen_sites.any():
         assert vectors is not None  # with frozen molecules there are some
         constants["coulomb_frozen"], pressure = _frozen_correction(parts, sites, charge * frozen_sites, vectors)
     return Interactions(terms, constants, pressure, None, error * COULOMB, tuple(notes))
+
+
+def _arms(state: State, sites: BodySites | CentralSites) -> np.ndarray:
+    """Positions (s, 3) of sites from the centres of mass, lab frame."""
+    if not len(state.rotation):
+        return np.zeros((len(sites.molecule), 3))
+    return np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
+
+
+def _surface_strength(forces: Any) -> tuple[float, float, float]:
+    """See `corrections.SurfaceDipole`."""
+    if forces.ewald_slab is None:
+        return (2 * pi / (2 * forces.ewald_surface_permittivity + 1),) * 3
+    x, y, z = (2 * pi if axis == forces.ewald_slab else 0.0 for axis in "xyz")
+    return x, y, z
+
+
+def _checked_slab(parts: SystemParts, sites: BodySites | CentralSites, charge: np.ndarray) -> str:
+    """A note on the vacuum around a slab. Raises SceneError where it is too thin, and for other wrong geometries."""
+    k, cell, faults = "xyz".index(parts.scene.forces.ewald_slab), cell_of(parts.space), []
+    across = [i for i in range(3) if i != k]
+    if cell[k, across].any() or cell[across, k].any():
+        faults.append("the edge along the normal must be at right angles to the others")
+    height, lateral = cell[k, k], float(np.linalg.norm(cell[across], axis=1).max())
+    centre = parts.state.position[:, k]
+    sorted_at = np.sort((centre[sites.molecule] + _arms(parts.state, sites)[:, k]) % height)
+    gaps = np.diff(sorted_at, append=sorted_at[0] + height)
+    gap, boundary = float(gaps.max()), sorted_at[gaps.argmax()] + gaps.max() / 2
+    note = (
+        f"{gap:.3g} Å along {parts.scene.forces.ewald_slab} are empty, {gap / lateral:.2g} of the longest edge across"
+    )
+    if gap < LEAST_VACUUM * lateral:
+        faults.append(f"{note}, which has to be at least {LEAST_VACUUM:g}: add vacuum, or leave ewald_slab out")
+    net = np.abs(np.bincount(sites.molecule, charge)) > NEUTRAL * np.abs(charge).max()
+    if len(set(np.floor((centre[np.flatnonzero(net)] - boundary) / height))) > 1:
+        faults.append("charged molecules are in different images of the slab: shift the structure until it is whole")
+    if faults:
+        raise SceneError(parts.scene.source, [f"forces.ewald_slab: {fault}" for fault in faults])
+    left = np.exp(-2 * pi * gap / lateral)
+    return f"ewald_slab: {note}; of the field at the surface, images along it have at most {left:.1g}"
 
 
 def _frozen_correction(
@@ -200,17 +246,15 @@ def _frozen_correction(
     """Constant energy and pressure that cancel the interactions between frozen molecules in sums over images. charge
     (s,) is 0 for sites that move."""
     state, forces, volume = parts.state, parts.scene.forces, parts.space.volume
-    arms = np.zeros((len(charge), 3))
-    if len(state.rotation):
-        arms = np.einsum("sij,sj->si", state.rotation[sites.molecule], sites.offsets())
+    arms = _arms(state, sites)
     position = state.position[sites.molecule] + arms
     energy, force, virial = direct_sum.ewald_sum_in_numpy(
         charge, position, cell_of(parts.space), forces.ewald_alpha_per_A, vectors
     )
     dipole = charge @ position
-    surface = 2 * pi / ((2 * forces.ewald_surface_permittivity + 1) * volume)
+    surface = np.array(_surface_strength(forces)) / volume
     force -= 2 * surface * charge[:, None] * dipole
-    energy += surface * float(dipole @ dipole)
-    trace = float(virial.trace()) + 3 * surface * float(dipole @ dipole)
-    trace -= 2 * surface * float(dipole @ dipole) + float((force * arms).sum())
+    of_surface = float(surface @ dipole**2)
+    energy += of_surface
+    trace = float(virial.trace()) + of_surface - float((force * arms).sum())
     return -energy, -trace / (3 * volume)
