@@ -661,14 +661,22 @@ def total(system, engine, state):
     return coulomb(observe(system, engine, state).components)
 
 
-@pytest.mark.parametrize("method", [TIGHT_EWALD, TIGHT_PME])
-@pytest.mark.parametrize(("surface", "angles"), [(np.inf, 90.0), (2.0, 90.0), (np.inf, 80.0)])
-def test_forces_and_torques_are_the_gradient(method, surface, angles):
+def surrounded(method, surface, angles):
+    """A scene with a permittivity around all images, or with images of a slab across z removed."""
+    if surface == "z":
+        molecules, box = [SALT[1]], {"lengths_A": [10.0, 10.5, 7.0], "vacuum_A": 8.0}
+        forces = method | {"ewald_slab": "z", "cutoff_A": 4.9, "ewald_alpha_per_A": 1.2}
+        return small_scene({}, None, molecules=molecules, box=box, forces=forces)
     molecules = [SALT[1]] if surface < np.inf else SALT
-    scene = small_scene(
-        {}, None, molecules=molecules, box={"lengths_A": [13.5, 14.0, 15.0], "angles_deg": [angles] * 3},
-        forces=method | {"ewald_surface_permittivity": surface},
-    )  # fmt: skip
+    box = {"lengths_A": [13.5, 14.0, 15.0], "angles_deg": [angles] * 3}
+    forces = method | {"ewald_surface_permittivity": surface}
+    return small_scene({}, None, molecules=molecules, box=box, forces=forces)
+
+
+@pytest.mark.parametrize("method", [TIGHT_EWALD, TIGHT_PME])
+@pytest.mark.parametrize(("surface", "angles"), [(np.inf, 90.0), (2.0, 90.0), ("z", 90.0), (np.inf, 80.0)])
+def test_forces_and_torques_are_the_gradient(method, surface, angles):
+    scene = surrounded(method, surface, angles)
     system, engine, state = shaken(build(scene), 8)
     engine = Engine(system.model, {name: term for name, term in system.terms.items() if name.startswith("coulomb")})
     load, _ = engine.evaluate(state)
@@ -701,16 +709,12 @@ def test_forces_and_torques_are_the_gradient(method, surface, angles):
     ("method", "surface", "angles"),
     [
         (TIGHT_EWALD, np.inf, 90.0), (TIGHT_EWALD, 2.0, 90.0), (TIGHT_PME, np.inf, 90.0), (TIGHT_PME, 2.0, 90.0),
-        (TIGHT_EWALD, np.inf, 80.0), (TIGHT_PME, np.inf, 80.0),
+        (TIGHT_EWALD, np.inf, 80.0), (TIGHT_PME, np.inf, 80.0), (TIGHT_EWALD, "z", 90.0), (TIGHT_PME, "z", 90.0),
     ],
 )  # fmt: skip
 def test_virial_is_the_slope_of_the_energy_with_the_volume(method, surface, angles):
     """Along each edge by itself with Ewald. On a grid only all together: the best influence function is not strained."""
-    molecules = [SALT[1]] if surface < np.inf else SALT
-    scene = small_scene(
-        {}, None, molecules=molecules, box={"lengths_A": [13.5, 14.0, 15.0], "angles_deg": [angles] * 3},
-        forces=method | {"ewald_surface_permittivity": surface},
-    )  # fmt: skip
+    scene = surrounded(method, surface, angles)
     system, _, state = shaken(build(scene), 9)
     terms = {name: term for name, term in system.terms.items() if name.startswith("coulomb")}
     virial = sum(tally.virial for tally in Engine(system.model, terms).evaluate(state)[1].values())
