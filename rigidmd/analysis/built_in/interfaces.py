@@ -17,6 +17,8 @@ MN_PER_M = 100 * BAR
 BIN = 0.5  # Å
 #: The density of the vapour is at most this fraction of the density of the liquid.
 LARGEST_RATIO = 0.5
+#: Least number of dipoles in a bin for a mean, as a fraction of the largest number in a bin.
+FEWEST = 1e-3
 
 
 class Slab(NamedTuple):
@@ -115,7 +117,8 @@ def interfaces(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
             at = slab.centre[:, kind.index]
             count = np.histogram(np.abs(at), edges)[0]
             total = np.histogram(np.abs(at), edges, weights=cosine * np.sign(at))[0]
-            mean = np.divide(total, count, out=np.full(len(z), np.nan), where=count > 0)
+            known = count > FEWEST * count.max()
+            mean = np.divide(total, count, out=np.full(len(z), np.nan), where=known)
             title = f"mean cosine of dipoles {kind.name}"
             found.curves.append(Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0))
     return found
@@ -140,7 +143,7 @@ def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
     span = float(time[-1] - time[0])
     tau = correlation_time(series, span / (len(time) - 1))
     running = np.cumsum(series) / np.arange(1, len(series) + 1)
-    some = np.unique(np.linspace(0, len(series) - 1, 500).astype(int))
+    some = np.unique(np.linspace(len(series) // 20, len(series) - 1, 500).astype(int))
     found = AnalysisResult("surface_tension", f"surface tension across {axis}")
     found.curves.append(
         Curve(
