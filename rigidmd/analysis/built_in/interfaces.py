@@ -1,5 +1,6 @@
 """Slabs between two vapours: coexisting densities, width and orientation at the interface, surface tension."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -75,8 +76,10 @@ def fitted(slab: Slab) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     top, low = float(np.quantile(density, 0.95)), float(density[-bins // 5 :].mean())
     half = float(np.sum(density - low) * (edges[1] - edges[0]) / max(top - low, 1e-9 * top))
     try:
-        found, _ = optimize.curve_fit(profile, z, density, (top, low, half, 2.0), maxfev=4000)
-    except RuntimeError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", optimize.OptimizeWarning)
+            found, _ = optimize.curve_fit(profile, z, density, (top, low, half, 2.0), maxfev=4000)
+    except (RuntimeError, optimize.OptimizeWarning):
         raise OutputError("the density has no profile of a slab between two vapours") from None
     liquid, vapour, half, width = found
     if not (vapour < LARGEST_RATIO * liquid and abs(width) < half < slab.height / 2 - abs(width)):
