@@ -30,9 +30,9 @@ CASES = {
     "dimer_double": ("two waters, velocity_verlet, double", "water_dimer", {"precision": "double"},
                      "velocity_verlet", "exact", 0.5, 10**8),
     "dimer_mixed": ("two waters, velocity_verlet, mixed", "water_dimer", {"precision": "mixed"},
-                    "velocity_verlet", "exact", 0.5, 10**8),
+                    "velocity_verlet", "exact", 0.5, 2 * 10**7),
     "dimer_6_double": ("two waters, srkn_6, double", "water_dimer", {"precision": "double"}, "srkn_6", "exact", 0.5, 10**7),
-    "dimer_6_mixed": ("two waters, srkn_6, mixed", "water_dimer", {"precision": "mixed"}, "srkn_6", "exact", 0.5, 10**7),
+    "dimer_6_mixed": ("two waters, srkn_6, mixed", "water_dimer", {"precision": "mixed"}, "srkn_6", "exact", 0.5, 10**6),
 }  # fmt: skip
 QUANTITIES = {
     "L": "angular momentum, relative",
