@@ -238,7 +238,10 @@ def run_openmm(run: Run, folder: Path, start: Path) -> tuple:
         rows.append((state.getPotentialEnergy()._value, mass / volume, 10 * volume ** (1 / 3)))
         frames.append(10 * state.getPositions(asNumpy=True)._value[::3])
         if frame < FRAMES:
-            integrator.step(round(1000 * EVERY / run.step))
+            try:
+                integrator.step(round(1000 * EVERY / run.step))
+            except openmm.OpenMMException as error:
+                raise Failed(str(error)) from None
     cost = (time.process_time() - began) / NS
     energy, density, edges = np.array(rows).T
     return energy, density, np.array(frames), edges, cost
