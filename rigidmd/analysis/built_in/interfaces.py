@@ -143,6 +143,7 @@ def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
     normal = pressure[slab.axis]
     series = 0.5 * slab.height * 1.5 * (normal - pressure.mean(axis=0)) * BAR / MN_PER_M
     value, error = mean_and_error(series)
+    assert value is not None  # there are samples
     span = float(time[-1] - time[0])
     tau = correlation_time(series, span / (len(time) - 1))
     running = np.cumsum(series) / np.arange(1, len(series) + 1)
