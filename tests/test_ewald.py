@@ -620,7 +620,7 @@ def test_waves_without_compiled_code():
     engine.evaluate(state)
     term, own = system.terms["coulomb_reciprocal"], engine.workspaces["coulomb_reciprocal"].sums
     energy, force, virial = ewald_sum_in_numpy(
-        term.charge, own.position, cell_of(system.space), term.alpha, term.k_vectors
+        term.charge, own.position, cell_of(system.space), term.smooth.alpha, term.k_vectors
     )
     assert energy == pytest.approx(own.tallies[:, 0].sum(), rel=1e-11)
     assert force == pytest.approx(own.force, abs=1e-11 * np.abs(force).max())

@@ -131,6 +131,8 @@ def interactions(parts: SystemParts) -> Interactions:
     names = [f"potentials.{key}" for key in POTENTIALS if getattr(forces, key) is not None]
     if any(m.charges.any() for m in parts.species):
         names.append(ELECTROSTATICS[forces.electrostatics].module)
+    if forces.dispersion != "cutoff":
+        names.append("ewald.dispersion")
     found = [import_module(f"rigidmd.forces.{name}").interactions(parts) for name in names if name]
     return Interactions(
         {name: term for part in found for name, term in part.terms.items()},
@@ -170,21 +172,24 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
 
 def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space, charged: bool) -> list[str]:
     """What is not compiled for this scene, and why. charged : whether a site has a charge"""
-    forces, has_images, removal = scene.forces, "coulomb_reciprocal" in terms, scene.run.remove_momentum_interval_ps
+    forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
+    has_sums = any(name.endswith("_reciprocal") for name in terms)
+    direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
+    without_tail = forces.dispersion == "cutoff" and not forces.tail_correction
     method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
         for key, (title, without) in POTENTIALS.items()
     } | {
         f"charges: {'electrostatics is none' if charged else 'no site has one'}": not has_charges,
-        f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_images,
-        "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": has_images and method == "ewald",
+        f"sums over periodic images, Fourier transforms: electrostatics is {method}": has_charges and not has_sums,
+        "Fourier transforms: electrostatics is ewald, a direct sum over k-vectors": direct,
         "rotation and torques: every molecule is a point": isinstance(model.rotor, NoRotor),
         "periodic images: no box": space.volume == inf,
         "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
         "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
         "removal of the total momentum: run.remove_momentum_interval_ps is false": removal is False,
-        "tail correction: only by default in a periodic box that molecules fill evenly": not forces.tail_correction,
+        "tail correction: only by default in a periodic box that molecules fill evenly": without_tail,
     }  # fmt: skip
     fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]
     return [

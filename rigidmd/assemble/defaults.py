@@ -72,6 +72,11 @@ def with_defaults(scene: MolecularScene, composition: Composition) -> SceneWithD
     if not faults and of_method is not None:
         found = of_method(scene.forces, composition, numbers["cutoff_A"], scene.engine.is_external)
         faults = found.errors
+    if not faults and scene.forces.dispersion != "cutoff":
+        from rigidmd.forces.ewald import dispersion  # for these scenes only
+
+        of_dispersion = dispersion.settings(scene.forces, composition, numbers["cutoff_A"])
+        numbers, faults = numbers | of_dispersion.numbers, of_dispersion.errors
     if scene.output.pressure_tensor_interval_ps and composition.space.volume == inf:
         why = "without which the pressure is not defined"
         faults.append(f"output.pressure_tensor_interval_ps needs a periodic box, {why}")
@@ -104,7 +109,8 @@ def with_momentum_removal(scene: MolecularScene, keeps_momentum: np.ndarray) -> 
     """A scene with the default of run.remove_momentum_interval_ps. keeps_momentum (3,) : conserved components."""
     if scene.run.remove_momentum_interval_ps is not None:
         return scene
-    removed = not ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum and keeps_momentum.any()
+    conserved = ELECTROSTATICS[scene.forces.electrostatics].conserves_momentum and scene.forces.dispersion != "pme"
+    removed = not conserved and keeps_momentum.any()
     run = {"remove_momentum_interval_ps": REMOVE_MOMENTUM_INTERVAL if removed else False}
     return scene.model_copy(update={"run": scene.run.model_copy(update=run)})
 
@@ -126,6 +132,7 @@ def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tup
         custom = forces.custom or scene.user_code.forces
         external = scene.engine.is_external and any(stage.has_barostat for stage in scene.stages)
         other = custom or external or scene.fields.walls or any(m.frozen for m in scene.molecules)
+        other = other or forces.dispersion != "cutoff"
         numbers["tail_correction"] = forces.lennard_jones and not other and is_homogeneous(composition)
     return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), faults
 

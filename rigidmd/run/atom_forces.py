@@ -18,9 +18,8 @@ from rigidmd.core.state import NOW, State
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.observables import observe
 from rigidmd.engines.system import System
-from rigidmd.forces.neighbors.pair_loop import PairForces
+from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
-from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.io.formats import format_of
 from rigidmd.io.formats.through_ase import EV, atoms_of_sites, atoms_of_system
 from rigidmd.mechanics.rotation import hat
@@ -180,10 +179,8 @@ def site_forces(
         of_term = np.array(cast(Any, workspace).site_force)
         at = _site_indices(system, sites)
         if name.endswith("reciprocal"):
-            real = cast(PairForces, system.terms[name.replace("reciprocal", "real")])
-            law = cast(ScreenedCoulomb, real.potential)
-            position = (state.position[system.sites.molecule] + arm)[at]
-            of_term = of_term + forces_inside(law.charge, position, sites.first, law.alpha)
+            term, position = cast(EwaldSum, system.terms[name]), (state.position[system.sites.molecule] + arm)[at]
+            of_term = of_term + forces_inside(term.charge, position, sites.first, term.smooth)
         np.add.at(on_sites, at, of_term)
     atom = system.sites.mass > 0
     found = on_sites[atom] + _massless_forces_on_atoms(system, state, on_sites)[atom]

@@ -4,11 +4,10 @@ user-defined forces, which are compared with their energies."""
 # isort: skip_file
 from collections.abc import Callable, Sequence
 from functools import partial
-from math import inf, pi, sqrt
+from math import inf
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from scipy.special import erf
 
 from rigidmd.assemble.build import build
 from rigidmd.core.state import Load, State
@@ -20,6 +19,7 @@ from rigidmd.forces.ewald.direct_sum import EwaldSum
 from rigidmd.forces.ewald.errors import (
     charges_in, filled_fraction, k_cutoff_of_count, k_space_error, pme_error, real_error,
 )  # fmt: skip
+from rigidmd.forces.ewald.smooth import InverseR, Smooth
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
@@ -68,12 +68,13 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     counts = np.bincount(system.model.species, minlength=len(system.species))
     charges, cutoff = charges_in(system.species, counts), not_none(system.scene.forces.ewald_cutoff_A)
     if isinstance(term, EwaldSum):
-        reciprocal = k_space_error(charges, term.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
+        reciprocal = k_space_error(charges, term.smooth.alpha, k_cutoff_of_count(term.k_vectors.total, volume), volume)
     else:
         term = cast("Pme", term)
-        reciprocal = pme_error(charges, term.alpha, cell, term.grid, term.order)
+        reciprocal = pme_error(charges, term.smooth.alpha, cell, term.grid, term.order)
     filled = filled_fraction(system.species, counts, volume)
-    return float(np.hypot(real_error(charges, term.alpha, cutoff, volume), reciprocal)) / np.sqrt(filled) * COULOMB
+    real = real_error(charges, term.smooth.alpha, cutoff, volume)
+    return float(np.hypot(real, reciprocal)) / np.sqrt(filled) * COULOMB
 
 
 def single_precision_errors(system: System, state: State) -> tuple[float, float] | None:
@@ -98,20 +99,19 @@ def _coulomb(system: System, state: State) -> tuple[np.ndarray, float]:
     position = np.empty_like(force)
     compute_site_positions(real.sites, state, position)
     law = cast(ScreenedCoulomb, real.potential)
-    force = force + forces_inside(law.charge, position, real.sites.first, law.alpha)
+    force = force + forces_inside(law.charge, position, real.sites.first, InverseR(law.alpha))
     constants = sum(energy for name, energy in system.constants.items() if name.startswith("coulomb"))
     return force, sum(tally.energy for tally in tallies.values()) + constants
 
 
-def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, alpha: float) -> np.ndarray:
+def forces_inside(charge: np.ndarray, position: np.ndarray, first: np.ndarray, smooth: Smooth) -> np.ndarray:
     """Forces (s, 3) that cancel the forces of the reciprocal part between sites of one molecule."""
     force = np.zeros_like(position)
     count = np.diff(first)
     for gap in range(1, count.max(initial=1)):
         i = np.concatenate([np.arange(a, a + n - gap) for a, n in zip(first[:-1], count, strict=True) if n > gap])
         d = position[i] - position[i + gap]
-        r = np.linalg.norm(d, axis=1)
-        slope = erf(alpha * r) / r**3 - 2 * alpha / sqrt(pi) * np.exp(-((alpha * r) ** 2)) / r**2
+        slope = smooth.force_over_r(np.linalg.norm(d, axis=1))
         pull = (charge[i] * charge[i + gap] * slope)[:, None] * d
         np.subtract.at(force, i, pull)
         np.add.at(force, i + gap, pull)

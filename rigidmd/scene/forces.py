@@ -142,6 +142,18 @@ class Forces(Section):
     """Add the energy and pressure of Lennard-Jones beyond the cutoff; `pressure` includes it, `virial` does not.
     Default: true in a periodic box that the molecules fill evenly; false with walls, frozen molecules, custom forces or
     empty space"""
+    dispersion: Literal["cutoff", "ewald", "pme"] = "cutoff"
+    """Attraction -C6/r⁶ of Lennard-Jones sites: within the cutoff, or also of all periodic images beyond it, by a sum
+    over k-vectors (ewald) or on a grid (pme), with the geometric mixing rule for C6 there"""
+    dispersion_accuracy: Annotated[float, Strict(), Field(gt=0, le=0.1)] | None = None
+    """With a sum of dispersion: rms error of its force on a site, relative to the largest 24 epsilon/sigma of a site,
+    the attraction at sigma; sets the keys below; default: 5e-5"""
+    dispersion_beta_per_A: Positive | None = None
+    """With a sum of dispersion: splitting parameter"""
+    dispersion_order: Annotated[int, Strict(), Field(ge=3, le=8)] | None = None
+    """With dispersion = pme: order of the B-splines"""
+    dispersion_grid: tuple[GridSize, GridSize, GridSize] | None = None
+    """With dispersion = pme: grid points, as for pme_grid"""
     electrostatics: Literal[tuple(ELECTROSTATICS)] | None = None  # type: ignore[valid-type]
     """Coulomb forces: ewald and pme act on all periodic images, reaction_field and damped_shifted_force within the
     cutoff, coulomb on all pairs without a periodic box; none ignores charges. Default: pme in a periodic box, coulomb
@@ -187,6 +199,12 @@ class Forces(Section):
     def _errors(self):
         if self.switch_start_A is not None and "switch" not in f"{self.truncation} {self.reaction_field_truncation}":
             yield f"switch_start_A would do nothing with truncation = {self.truncation!r}: add truncation = 'switch'"
+        if self.dispersion == "cutoff":
+            names = (f"dispersion_{key}" for key in ("accuracy", "beta_per_A", "order", "grid"))
+            idle = [key for key in names if getattr(self, key) is not None]
+            yield from (f"{key} would do nothing with dispersion = 'cutoff' (the default)" for key in idle)
+        else:
+            yield from (f"dispersion = {self.dispersion!r}: {why}" for why, wrong in self._not_summable if wrong)
         yield from self.idle_key_errors(self.electrostatics or PERIODIC)
         if self.ewald_k2_max is not None and self.ewald_k_max is None:
             yield "ewald_k2_max needs ewald_k_max too"
@@ -197,6 +215,19 @@ class Forces(Section):
         determined = self.sets_k_vectors or (self.pme_grid is not None and self.pme_order is not None)
         if determined and self.ewald_alpha_per_A is not None and self.ewald_accuracy is not None:
             yield "ewald_accuracy would do nothing: alpha and the k-vectors or the grid are given"
+
+    @property
+    def _not_summable(self) -> tuple[tuple[str, Any], ...]:
+        """Messages on keys that exclude a sum of dispersion, and whether they are set."""
+        grid = self.dispersion_order or self.dispersion_grid
+        return (
+            ("only Lennard-Jones forces have such a sum; lennard_jones is false", not self.lennard_jones),
+            ("custom forces have no such sum, so that a part of the dispersion would end at the cutoff", self.custom),
+            ("tail_correction would count what lies beyond the cutoff twice; leave it out", self.tail_correction),
+            (f"truncation = {self.truncation!r} would change the sum; take 'shift' or 'plain'",
+                self.truncation not in ("shift", "plain")),
+            ("dispersion_order and dispersion_grid belong to 'pme'", self.dispersion == "ewald" and grid),
+        )  # fmt: skip
 
     @property
     def idle_keys(self) -> list[str]:

@@ -142,6 +142,11 @@ class Molecule:
         return (self.mass, *map(float, self.inertia), float(len(self.masses)))
 
     @property
+    def dispersion(self) -> np.ndarray:
+        """c (s,) of each site, 2 sigma³ sqrt(epsilon): c_i c_j is the geometric mean of the coefficients of 1/r⁶."""
+        return 2 * self.sigma**3 * np.sqrt(self.epsilon)
+
+    @property
     def degrees_of_freedom(self) -> int:
         return 3 + rotational_freedom(self.kind)
 

@@ -295,6 +295,8 @@ class MolecularScene(Scene):
                 yield f"stages.{k}.volume = 'mean' {why}; {found}. Add one, or leave volume out"
         if self.forces.tail_correction and any(species.frozen for species in self.molecules):
             yield "forces.tail_correction assumes a uniform liquid: omit it with frozen molecules"
+        if self.forces.dispersion != "cutoff" and any(species.frozen for species in self.molecules):
+            yield "forces.dispersion: sums over images also act between frozen molecules: use cutoff, or freeze none"
         if self.run.remove_momentum_interval_ps and any(species.frozen for species in self.molecules):
             yield "run.remove_momentum_interval_ps: the total momentum is not conserved with frozen molecules; omit it"
         cutoff, start = self.forces.cutoff_A, self.forces.switch_start_A

@@ -169,8 +169,8 @@ def of_pairs(term: PairWorkspace, state: State, every: float) -> dict:
 
 def of_mesh(term: NamedTuple) -> dict[str, float]:
     """Times of the kernels of the mesh, ms."""
-    content, blocks = (term.alpha, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
-    content_of = {"convolve": (term.alpha, term.mesh, None)}
+    content, blocks = (term.smooth, term.charge, term.spline, term.mesh), len(term.mesh.tallies)
+    content_of = {"convolve": (term.smooth, term.mesh, None)}
     times = {task: milliseconds(run_blocks, term.code, task, content_of.get(task, content), blocks) for task in MESH}
     return times | {"sort": milliseconds(run_once, term.code, "sort", content)}
 

@@ -154,6 +154,7 @@ def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
             "surface_tension", ("Time (ps)", time[some]), "running mean (mN/m)", {"running mean (mN/m)": running[some]}
         )
     )
-    note = "of the forces in the run: without dispersion beyond the cutoff"
+    is_cut = frames.system.scene.forces.dispersion == "cutoff"
+    note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
     found.values.append(converged_value("surface tension", "mN/m", value, error, span, tau, note))
     return found

@@ -53,6 +53,7 @@ TRANSLATIONS = Translations(
         Key("forces.truncation", {  # vdw-modifier
             "plain": "None", "shift": "Potential-shift", "force_switch": "Force-switch", "switch": "Potential-switch",
         }, matters=lambda view: view.lennard_jones),
+        Key("forces.dispersion", {"cutoff": ""}),
         Key("forces.electrostatics", {"none": "Cut-off", "reaction_field": "Reaction-Field", "pme": "PME"},
             matters=lambda view: view.coulomb),
         Key("forces.reaction_field_truncation", {None: "", "plain": "None", "shift": "Potential-shift"}),

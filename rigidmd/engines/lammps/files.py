@@ -44,6 +44,7 @@ TRANSLATIONS = Translations(
             "plain": "lj/cut", "shift": "lj/cut", "force_shift": "lj/smooth/linear", "force_switch": "lj/gromacs",
             "switch": "lj/mdf", "smooth_switch": "table",
         }, matters=lambda view: view.is_truncated),
+        Key("forces.dispersion", {"cutoff": ""}),
         Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "table")),
         Key("forces.electrostatics", {  # kspace style
             **dict.fromkeys(("none", "coulomb", "reaction_field", "damped_shifted_force"), ""), "ewald": "ewald",

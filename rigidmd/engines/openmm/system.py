@@ -64,6 +64,7 @@ TRANSLATIONS = Translations(
     "OpenMM",
     scene=(
         Key("forces.truncation", dict.fromkeys(TRUNCATIONS, "formula"), matters=lambda view: view.is_truncated),
+        Key("forces.dispersion", {"cutoff": ""}),
         Key("forces.reaction_field_truncation", dict.fromkeys((None, *TRUNCATIONS), "formula")),
         Key("forces.electrostatics", {
             "none": "", "coulomb": "", "reaction_field": "formula", "damped_shifted_force": "formula", "ewald": "PME",

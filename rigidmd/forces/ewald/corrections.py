@@ -27,7 +27,13 @@ def background(square: float, alpha: float) -> Background:
     return Background(-pi / (2 * alpha**2) * square)
 
 
-@implements(terms.add_forces, Background)
+class MeanDispersion(NamedTuple):
+    """The k-vector 0 of dispersion: the attraction of uniform densities, energy -pi^(3/2) beta³/(6 V) (sum of c)²."""
+
+    strength: float  # energy times the volume, u Å⁵/ps²
+
+
+@implements(terms.add_forces, (Background, MeanDispersion))
 def _add_background(term, state, load, tally):
     if tally is not None:
         energy = term.strength / volume_of(state.cell)

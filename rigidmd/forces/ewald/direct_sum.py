@@ -16,6 +16,7 @@ from rigidmd.compile import BLOCKS, Code, call_blocks, implements, kernel, load_
 from rigidmd.compile.simd import broadcast, lane_count, lanes_of, load, store, sum_lanes
 from rigidmd.core.state import OK, TALLY_SIZE
 from rigidmd.forces import terms
+from rigidmd.forces.ewald.smooth import InverseR, Smooth, slope, strength_times_square
 from rigidmd.forces.neighbors.sites import (
     BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
 )  # fmt: skip
@@ -109,7 +110,7 @@ class KSpaceSums(NamedTuple):
     charge: np.ndarray  # (slots,)
     cosine: np.ndarray  # (3, largest n + 1, slots) of 2 pi n times the fractional coordinate
     sine: np.ndarray
-    strength: np.ndarray  # (k-vectors,) 4 pi/V exp(-k²/4 alpha²)/k²: times |S|², the energy of n and -n together
+    strength: np.ndarray  # (k-vectors,) times |S|², the energy of n and -n together
     real: np.ndarray  # (k-vectors,) real part of S(k), then of 2 strength S(k)
     imaginary: np.ndarray
     force_by_component: np.ndarray  # (3, slots) forces on the sites, by component
@@ -118,12 +119,14 @@ class KSpaceSums(NamedTuple):
 
 
 class EwaldSum(NamedTuple):
-    alpha: float  # 1/Å
-    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
+    smooth: Smooth
+    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²; of dispersion c, where c²/r⁶ is
     sites: BodySites | CentralSites
     k_vectors: KVectors
 
-    acts_on_charges = True
+    @property
+    def acts_on_charges(self) -> bool:
+        return isinstance(self.smooth, InverseR)
 
     def workspace(self, setup: Setup) -> "EwaldWorkspace":
         s, k_vectors = len(self.charge), self.k_vectors
@@ -136,11 +139,11 @@ class EwaldSum(NamedTuple):
             imaginary=np.zeros(k_vectors.total // 2), force_by_component=np.zeros((3, slots)),
             tallies=np.zeros((len(k_vectors.bounds) - 1, TALLY_SIZE)), virial=virial_buffer(),
         )  # fmt: skip
-        return EwaldWorkspace(self.alpha, self.sites, k_vectors, sums)
+        return EwaldWorkspace(self.smooth, self.sites, k_vectors, sums)
 
 
 class EwaldWorkspace(NamedTuple):
-    alpha: float
+    smooth: Smooth
     sites: BodySites | CentralSites
     k_vectors: KVectors
     sums: KSpaceSums
@@ -152,7 +155,7 @@ class EwaldWorkspace(NamedTuple):
         return self.sums.force
 
     def with_code(self) -> "EwaldWorkspace":
-        sums, content = self.sums, (self.alpha, self.k_vectors, self.sums)
+        sums, content = self.sums, (self.smooth, self.k_vectors, self.sums)
         code = Code(
             phases=(_compute_phases, content), sum=(_sum_structure_factors, content), forces=(_compute_forces, content),
             **position_task(self.sites, sums.position), **load_tasks(self.sites, sums.force, sums.virial),
@@ -182,8 +185,8 @@ def _add_ewald_sum(term, state, load, tally):
     call_blocks(code, "positions", pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position)))
     if follow_cell(state.cell, sums.cell):
         volume = abs(invert_cell(sums.cell, sums.reciprocal))
-        _set_strengths(term.k_vectors, sums, term.alpha, volume)
-    arguments = pack_arguments((term.alpha, term.k_vectors, sums))
+        _set_strengths(term.k_vectors, sums, term.smooth, volume)
+    arguments = pack_arguments((term.smooth, term.k_vectors, sums))
     blocks = len(sums.tallies)
     call_blocks(code, "phases", arguments, blocks)
     call_blocks(code, "sum", arguments, blocks)
@@ -193,7 +196,7 @@ def _add_ewald_sum(term, state, load, tally):
 
 
 @kernel
-def _set_strengths(k_vectors, sums, alpha, volume):
+def _set_strengths(k_vectors, sums, smooth, volume):
     column, b = k_vectors.column, sums.reciprocal
     for c in range(len(column)):
         first = column[c, 3]
@@ -202,13 +205,13 @@ def _set_strengths(k_vectors, sums, alpha, volume):
             for d in range(3):
                 k = column[c, 0] * b[0, d] + column[c, 1] * b[1, d] + (column[c, 2] + n) * b[2, d]
                 k2 += k * k
-            sums.strength[first + n] = 4 * pi / volume * np.exp(-k2 / (4 * alpha * alpha)) / k2
+            sums.strength[first + n] = strength_times_square(smooth, k2, volume) / k2
 
 
 @task(count_references=False)
 def _compute_phases(arguments, block):
     """exp(2 pi i n x) of the sites of a block, by recurrence: one complex product for each multiple of the angle."""
-    _alpha, k_vectors, sums = load_arguments(arguments)
+    _smooth, k_vectors, sums = load_arguments(arguments)
     blocks, s = len(sums.tallies), len(sums.position)
     for i in range(s * block // blocks, s * (block + 1) // blocks):
         for d in range(3):
@@ -241,7 +244,7 @@ def _times(a, b):
 @task(count_references=False)
 def _sum_structure_factors(arguments, block):
     """S(k) of the columns of a block, with energy and virial; then S(k) is multiplied by 2 strength for the forces."""
-    alpha, k_vectors, sums = load_arguments(arguments)
+    smooth, k_vectors, sums = load_arguments(arguments)
     column, width = k_vectors.column, lanes_of(sums.charge)
     sums.tallies[block] = 0.0
     for c in range(k_vectors.bounds[block], k_vectors.bounds[block + 1]):
@@ -268,11 +271,11 @@ def _sum_structure_factors(arguments, block):
             sums.real[n], sums.imaginary[n] = 2 * strength * real, 2 * strength * imaginary
             energy = strength * (real * real + imaginary * imaginary)
             vector = (column[c, 0], column[c, 1], column[c, 2] + n - first)
-            add_k_vector(sums.tallies[block], energy, vector, sums.reciprocal, alpha)
+            add_k_vector(sums.tallies[block], energy, vector, sums.reciprocal, smooth)
 
 
 @kernel(inline=True, count_references=False)
-def add_k_vector(tally, energy, n, b, alpha):
+def add_k_vector(tally, energy, n, b, smooth):
     """Add energy and virial (Nose & Klein 1983) of k = 2 pi n times the reciprocal edges, with the rows of b (3, 3) 2
     pi times these."""
     k = (
@@ -280,17 +283,17 @@ def add_k_vector(tally, energy, n, b, alpha):
         n[0] * b[0, 1] + n[1] * b[1, 1] + n[2] * b[2, 1],
         n[0] * b[0, 2] + n[1] * b[1, 2] + n[2] * b[2, 2],
     )
-    slope = 2 / (k[0] * k[0] + k[1] * k[1] + k[2] * k[2]) + 1 / (2 * alpha * alpha)
+    fall = slope(smooth, k[0] * k[0] + k[1] * k[1] + k[2] * k[2])
     tally[0] += energy
     for row in range(3):
         for column in range(3):
             unit = 1.0 if row == column else 0.0
-            tally[1 + 3 * row + column] += energy * (unit - slope * k[row] * k[column])
+            tally[1 + 3 * row + column] += energy * (unit - fall * k[row] * k[column])
 
 
 @task(count_references=False)
 def _compute_forces(arguments, block):
-    _alpha, k_vectors, sums = load_arguments(arguments)
+    _smooth, k_vectors, sums = load_arguments(arguments)
     column, width = k_vectors.column, lanes_of(sums.charge)
     blocks, vectors = len(sums.tallies), len(sums.charge) // width
     for at in range(width * (vectors * block // blocks), width * (vectors * (block + 1) // blocks), width):

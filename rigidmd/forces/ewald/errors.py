@@ -1,13 +1,16 @@
 """Estimated errors of Ewald sums, and the settings that keep them within an accuracy: theory chapter `interactions`.
 
-The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance of 1 Å.
+The unit of an error, the rms over sites, is COULOMB, the force between two charges e at a distance of 1 Å; for
+dispersion it is u Å/ps².
 """
 
+from collections.abc import Callable
 from functools import cache
 from math import exp, inf, pi, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import erfcx, gammaincc
 
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 #: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16 they are good to 5 %.
@@ -37,12 +40,47 @@ class Charges(NamedTuple):
             found += product * np.sinc(k * distance / pi)
         return found
 
+    def transform(self, alpha: float, square: np.ndarray) -> np.ndarray:
+        """Fourier transform of the smooth part of the potential of a unit charge at k² > 0."""
+        return 4 * pi / square * np.exp(-square / (4 * alpha**2))
 
-def charges_in(species: list[Any], counts: np.ndarray) -> Charges:
-    """The charges of `counts` molecules of each species, each a `scene.models.Molecule`."""
+    def force_spectrum(self, alpha: float, k: np.ndarray) -> np.ndarray:
+        """Mean square force of a unit charge in a shell dk, times the volume."""
+        # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
+        return 8 * np.exp(-(k**2) / (2 * alpha**2))
+
+    def beyond(self, alpha: float, cutoff: float, volume: float) -> float:
+        """Error from the pairs beyond the cutoff (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
+        return 2 * self.square / sqrt(self.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
+
+
+class Dispersing(Charges):
+    """Sites with strengths c in place of charges, with the energy -c_i c_j/r⁶; c² in u Å⁸/ps²."""
+
+    def transform(self, alpha: float, square: np.ndarray) -> np.ndarray:
+        b2 = square / (4 * alpha**2)
+        shape = 1 - 2 * b2 + 2 * sqrt(pi) * b2**1.5 * erfcx(np.sqrt(b2))
+        return -(pi**1.5) * alpha**3 / 3 * np.exp(-b2) * shape
+
+    def force_spectrum(self, alpha: float, k: np.ndarray) -> np.ndarray:
+        return (k**2 * self.transform(alpha, k**2)) ** 2 / (2 * pi**2)
+
+    def beyond(self, alpha: float, cutoff: float, volume: float) -> float:
+        """Error from the pairs beyond the cutoff, with random positions there."""
+        r = cutoff * np.linspace(1, 6, 1001)
+        force = 6 / r**7 * gammaincc(4, (alpha * r) ** 2)
+        return self.square * sqrt(np.trapezoid(4 * pi * r**2 * force**2, r) / (self.count * volume))
+
+
+def charges_in(
+    species: list[Any], counts: np.ndarray, of: Callable[[Any], np.ndarray] = lambda m: m.charges,
+    kind: type[Charges] = Charges,
+) -> Charges:  # fmt: skip
+    """The charges, or other strengths `of` a molecule (s,), in `counts` molecules of each species, each a
+    `scene.models.Molecule`."""
     square, count, products, distances = 0.0, 0, [np.zeros(0)], [np.zeros(0)]
     for m, n in zip(species, map(int, counts), strict=True):
-        charge, position = m.charges[m.charges != 0], m.positions_body[m.charges != 0]
+        charge, position = of(m)[of(m) != 0], m.positions_body[of(m) != 0]
         count += n * len(charge)
         square += n * float(charge @ charge)
         i, j = np.tril_indices(len(charge), -1)
@@ -57,16 +95,23 @@ def charges_in(species: list[Any], counts: np.ndarray) -> Charges:
     sums, order = np.zeros(len(first)), np.argsort(first)
     np.add.at(sums, which, np.concatenate(products))
     rounded = [round(d, FINE) for d in distance[order].tolist()]
-    return Charges(count, square, np.array([sums[order], rounded]).T.copy())
+    return kind(count, square, np.array([sums[order], rounded]).T.copy())
 
 
 def real_error(charges: Charges, alpha: float, cutoff: float, volume: float) -> float:
-    """Error from the pairs beyond the cutoff (Kolafa & Perram 1992, Mol. Sim. 9, 351, eq. 18)."""
-    return 2 * charges.square / sqrt(charges.count * cutoff * volume) * exp(-((alpha * cutoff) ** 2))
+    """Error from the pairs beyond the cutoff."""
+    return charges.beyond(alpha, cutoff, volume)
 
 
 def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> float:
     """The alpha (1/Å) at which the pairs beyond the cutoff cause this error."""
+    if isinstance(charges, Dispersing):
+        low, high = 0.5, MAX_ALPHA_CUTOFF + 1e-3
+        while high - low > 1e-6:
+            middle = 0.5 * (low + high)
+            is_less = real_error(charges, middle / cutoff, cutoff, volume) <= error
+            low, high = (low, middle) if is_less else (middle, high)
+        return high / cutoff
     most = real_error(charges, 0.0, cutoff, volume)
     # a large error allows almost no screening; the formula holds for alpha cutoff down to 1/2
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
@@ -84,8 +129,7 @@ def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> fl
 def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:
     """Error from the k-vectors beyond k = radius (1/Å), see the theory chapter `interactions`."""
     k = np.linspace(radius, radius + 12 * alpha, 600)
-    # k² (4 pi/k² e^(-k²/4 alpha²))² 4 pi k² / (8 pi³)
-    density = 8 * np.exp(-(k**2) / (2 * alpha**2)) * charges.form(k)
+    density = charges.force_spectrum(alpha, k) * charges.form(k)
     return sqrt(charges.square / charges.count * np.trapezoid(density, k) / volume)
 
 
@@ -136,7 +180,7 @@ def pme_error(
     square = square * np.ones_like(weakened)
     square[0, 0, 0] = weakened[0, 0, 0] = 1.0  # k = 0 is excluded
     kept, whole = unaliased[0] * unaliased[1] * unaliased[2], every[0] * every[1] * every[2]
-    g = 4 * pi / square * np.exp(-square / (4 * alpha**2))
+    g = charges.transform(alpha, square)
     influence = square * g * kept / (whole * weakened)
     here = charges.form(np.sqrt(square))
     wrong = square * (g - influence * kept) ** 2 * here

@@ -13,6 +13,7 @@ from rigidmd.forces.ewald.errors import (
     COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, filled_fraction,
     k_cutoff_for, k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
+from rigidmd.forces.ewald.smooth import InverseR
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
 from rigidmd.forces.neighbors.space import Space, cell_of
 from rigidmd.forces.parts import Composition, Interactions, Settings, SystemParts
@@ -151,14 +152,14 @@ def interactions(parts: SystemParts) -> Interactions:
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)
     if parts.grid is None:
         assert vectors is not None  # with PME only, there may be none
-        reciprocal = direct_sum.EwaldSum(alpha, charge, sites, vectors)
+        reciprocal = direct_sum.EwaldSum(InverseR(alpha), charge, sites, vectors)
         how = f"{vectors.total} k-vectors, |n| up to {' '.join(map(str, vectors.most))}"
         if forces.ewald_k_max is not None and not np.array_equal(parts.basis, direct_sum.SAME_BASIS):
             how += "; they are the k-vectors that ewald_k_max means in the given cell"
     else:
         from rigidmd.forces.ewald.pme import Pme  # rocket-fft is for scenes with PME only
 
-        reciprocal = Pme(alpha, charge, sites, parts.grid, forces.pme_order)
+        reciprocal = Pme(InverseR(alpha), charge, sites, parts.grid, forces.pme_order)
         how = f"grid {' x '.join(map(str, parts.grid))}, splines of order {forces.pme_order}"
     terms = {"coulomb_real": parts.pair_forces(potential, sites), "coulomb_reciprocal": reciprocal}
     constants = {

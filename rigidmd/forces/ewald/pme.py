@@ -24,6 +24,7 @@ from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
 from rigidmd.forces import terms
 from rigidmd.forces.ewald.direct_sum import add_k_vector, invert_cell
 from rigidmd.forces.ewald.errors import aliases
+from rigidmd.forces.ewald.smooth import InverseR, Smooth, strength_times_square
 from rigidmd.forces.neighbors.sites import (
     BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
 )  # fmt: skip
@@ -76,13 +77,15 @@ class PmeMesh(NamedTuple):
 
 
 class Pme(NamedTuple):
-    alpha: float  # 1/Å
-    charge: np.ndarray  # (s,) in units where q²/r is an energy in u Å²/ps²
+    smooth: Smooth
+    charge: np.ndarray  # (s,) as in `direct_sum.EwaldSum`
     sites: BodySites | CentralSites
     grid: tuple[int, int, int]  # points along a, b, c
     order: int  # of the splines
 
-    acts_on_charges = True
+    @property
+    def acts_on_charges(self) -> bool:
+        return isinstance(self.smooth, InverseR)
 
     def workspace(self, setup: Setup) -> "PmeWorkspace":
         grid, order = self.grid, self.order
@@ -110,11 +113,11 @@ class Pme(NamedTuple):
             axes=np.arange(3)[:, None], tallies=np.zeros((blocks, TALLY_SIZE)), virial=virial_buffer(),
             not_finite=np.zeros(blocks, np.bool_), weight=np.zeros((blocks, 64), kind),
         )  # fmt: skip
-        return PmeWorkspace(self.alpha, self.charge, self.sites, spline, mesh)
+        return PmeWorkspace(self.smooth, self.charge, self.sites, spline, mesh)
 
 
 class PmeWorkspace(NamedTuple):
-    alpha: float
+    smooth: Smooth
     charge: np.ndarray
     sites: BodySites | CentralSites
     spline: Spline
@@ -127,11 +130,11 @@ class PmeWorkspace(NamedTuple):
         return self.mesh.force
 
     def with_code(self) -> "PmeWorkspace":
-        mesh, content = self.mesh, (self.alpha, self.charge, self.spline, self.mesh)
+        mesh, content = self.mesh, (self.smooth, self.charge, self.spline, self.mesh)
         code = Code(
             influence=(_set_influence, content), scale=(_scale_positions, content), sort=(_sort_sites, content),
-            spread=(_spread_charges, content), convolve=(_convolve, (self.alpha, mesh, None)),
-            convolve_with_virial=(_convolve, (self.alpha, mesh, mesh.tallies)), back=(_transform_back, content),
+            spread=(_spread_charges, content), convolve=(_convolve, (self.smooth, mesh, None)),
+            convolve_with_virial=(_convolve, (self.smooth, mesh, mesh.tallies)), back=(_transform_back, content),
             forces=(_interpolate_forces, content), **position_task(self.sites, mesh.position),
             **load_tasks(self.sites, mesh.force, mesh.virial),
         )  # fmt: skip
@@ -142,7 +145,7 @@ class PmeWorkspace(NamedTuple):
 def _add_pme(term, state, load, tally):
     code, mesh = term.code, term.mesh
     blocks = len(mesh.tallies)
-    arguments = pack_arguments((term.alpha, term.charge, term.spline, mesh))
+    arguments = pack_arguments((term.smooth, term.charge, term.spline, mesh))
     call_blocks(code, "positions", pack_arguments((term.sites, state, mesh.position)), blocks_of(len(state.position)))
     if follow_cell(state.cell, mesh.cell):
         invert_cell(mesh.cell, mesh.reciprocal)
@@ -154,9 +157,9 @@ def _add_pme(term, state, load, tally):
     call(code, "sort", arguments)
     call_blocks(code, "spread", arguments, blocks)
     if tally is None:
-        call_blocks(code, "convolve", pack_arguments((term.alpha, mesh, None)), blocks)
+        call_blocks(code, "convolve", pack_arguments((term.smooth, mesh, None)), blocks)
     else:
-        call_blocks(code, "convolve_with_virial", pack_arguments((term.alpha, mesh, mesh.tallies)), blocks)
+        call_blocks(code, "convolve_with_virial", pack_arguments((term.smooth, mesh, mesh.tallies)), blocks)
     call_blocks(code, "back", arguments, blocks)
     call_blocks(code, "forces", arguments, blocks)
     load_from_blocks(term.sites, code, state, load, mesh.force, mesh, tally)
@@ -165,8 +168,8 @@ def _add_pme(term, state, load, tally):
 
 @task(count_references=False)
 def _set_influence(arguments, block):
-    """The influence function for a block of rows: k² g U²/(sum U² sum k² U²), g = 4 pi exp(-k²/4 alpha²)/(k² V)."""
-    alpha, _charge, _spline, mesh = load_arguments(arguments)
+    """The influence function for a block of rows: k² g U²/(sum U² sum k² U²), with g of the kernel."""
+    smooth, _charge, _spline, mesh = load_arguments(arguments)
     b, of = mesh.reciprocal, mesh.alias
     volume = 8 * pi**3 / abs(
         b[0, 0] * (b[1, 1] * b[2, 2] - b[1, 2] * b[2, 1])
@@ -193,14 +196,14 @@ def _set_influence(arguments, block):
                 whole = of[0, 3, x] * of[1, 3, y] * of[2, 3, z]
                 mesh.influence[x, y, z] = 0.0
                 if x + y + z > 0:
-                    g = 4 * pi / volume * np.exp(-square / (4 * alpha * alpha))
+                    g = strength_times_square(smooth, square, volume)
                     mesh.influence[x, y, z] = g * unaliased / (whole * weakened)
 
 
 @task(count_references=False)
 def _scale_positions(arguments, block):
     """Positions of the sites of a block in grid cells."""
-    _alpha, charge, _spline, mesh = load_arguments(arguments)
+    _smooth, charge, _spline, mesh = load_arguments(arguments)
     mesh.not_finite[block] = False
     r, b = mesh.position, mesh.reciprocal
     for i in range(mesh.bounds[2, block], mesh.bounds[2, block + 1]):
@@ -219,7 +222,7 @@ def _scale_positions(arguments, block):
 @task(count_references=False)
 def _sort_sites(arguments, block):
     """Sort sites by the plane of their corner; the sort is stable."""
-    _alpha, _charge, _spline, mesh = load_arguments(arguments)
+    _smooth, _charge, _spline, mesh = load_arguments(arguments)
     first = mesh.first
     first[:] = 0
     for i in range(len(mesh.order)):
@@ -270,7 +273,7 @@ def _polynomials(spline, coefficients, powers, offset):
 @task(count_references=False)
 def _spread_charges(arguments, block):
     """Spread charges over the planes of a block, and Fourier transform the planes."""
-    _alpha, _charge, spline, mesh = load_arguments(arguments)
+    _smooth, _charge, spline, mesh = load_arguments(arguments)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     na, nb, nc = mesh.points[0], mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
@@ -305,12 +308,12 @@ def _spread_charges(arguments, block):
 
 @task(count_references=False)
 def _convolve(arguments, block):
-    alpha, mesh, tallies = load_arguments(arguments)
-    convolve_block(alpha, mesh, tallies, block)
+    smooth, mesh, tallies = load_arguments(arguments)
+    convolve_block(smooth, mesh, tallies, block)
 
 
 @kernel(inline=True, count_references=False)
-def convolve_block(alpha, mesh, tallies, block):
+def convolve_block(smooth, mesh, tallies, block):
     """Multiply a block of rows by the influence function; energy and virial into `tallies` unless None."""
     low, high = mesh.bounds[1, block], mesh.bounds[1, block + 1]
     spectrum, of, b = mesh.spectrum, mesh.alias, mesh.reciprocal
@@ -327,14 +330,14 @@ def convolve_block(alpha, mesh, tallies, block):
                     multiplicity = 0.5 if z == 0 or 2 * z == mesh.points[2] else 1.0
                     real, imaginary = float(value.real), float(value.imag)
                     energy = multiplicity * strength * (real * real + imaginary * imaginary)
-                    add_k_vector(tallies[block], energy, (of[0, 0, x], of[1, 0, y], of[2, 0, z]), b, alpha)
+                    add_k_vector(tallies[block], energy, (of[0, 0, x], of[1, 0, y], of[2, 0, z]), b, smooth)
     c2c(spectrum[:, low:high], spectrum[:, low:high], mesh.axes[0], False, 1.0, 1)
 
 
 @task(count_references=False)
 def _transform_back(arguments, block):
     """Transform the planes of a block back to the potential."""
-    _alpha, _charge, spline, mesh = load_arguments(arguments)
+    _smooth, _charge, spline, mesh = load_arguments(arguments)
     low, high = mesh.bounds[0, block], mesh.bounds[0, block + 1]
     nb, nc = mesh.points[1], mesh.points[2]
     order = len(spline.nodes)
@@ -353,7 +356,7 @@ def _transform_back(arguments, block):
 @task(count_references=False)
 def _interpolate_forces(arguments, block):
     """Forces on the sites of a block: minus the gradient of the potential at each site, times its charge."""
-    _alpha, charge, spline, mesh = load_arguments(arguments)
+    _smooth, charge, spline, mesh = load_arguments(arguments)
     na = mesh.points[0]
     order = len(spline.nodes)
     grid, weight = mesh.grid, mesh.weight[block]

@@ -5,13 +5,16 @@ from math import inf, pi
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numba import types
 from scipy.integrate import quad
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
-from rigidmd.compile.simd import inverse, inverse_square_root, load, zeros
+from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
+from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors import pair_loop as pairs
 from rigidmd.forces.parts import Interactions, SystemParts, Tail, gather_per_molecule, sites_named
+from rigidmd.forces.potentials.screened_coulomb import Screening, dispersion_screening
 from rigidmd.forces.potentials.truncation import (
     MINIMUM_TOLERANCE, NO_SWITCH, SWITCH_FUNCTIONS, ForceShifted, SwitchCorrection, SwitchTerm, Truncation,
     TruncationName, TruncationTerms, Unmodified, correction, needs_root, short_cutoff_note, switch_correction_of,
@@ -20,6 +23,16 @@ from rigidmd.forces.potentials.truncation import (
 from rigidmd.units import KJ_PER_MOL
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
+
+
+class ScreenedDispersion(NamedTuple):
+    """c_i c_j [(1 - g(beta r))/r⁶ - shift], added to Lennard-Jones within the cutoff where a sum over k-vectors has
+    the dispersion -c_i c_j (1 - g(beta r))/r⁶ of all pairs; g(x) = exp(-x²)(1 + x² + x⁴/2)."""
+
+    beta: float  # 1/Å
+    shift: float  # 1/Å⁶
+    screening: Screening
+    strength: np.ndarray | float  # (s,) or (slots,) c of each site; c² if all sites are of one kind
 
 
 class LennardJones(NamedTuple):
@@ -32,17 +45,25 @@ class LennardJones(NamedTuple):
     kind: np.ndarray  # (s,) kind of each site, index into c6 and c12
     c12: np.ndarray  # (kinds, kinds) u Å¹⁴/ps²
     c6: np.ndarray  # (kinds, kinds) u Å⁸/ps²
+    dispersion: ScreenedDispersion | tuple[()] = ()
 
     def for_slots(self, slots: int, dtype: type) -> "LennardJonesOneKind | LennardJonesManyKinds":
         """What the pair loop reads: numbers if all sites are of one kind, else a table for all slots."""
         head, kinds = self[:4], len(self.c12)
         c12, c6 = (float(self.c12[0, 0]), float(self.c6[0, 0])) if kinds == 1 else (1.0, 1.0)
+        dispersion = self.dispersion
+        if isinstance(dispersion, ScreenedDispersion):
+            strength = zeros(slots, dtype) if kinds > 1 else float(dispersion.strength[0] ** 2)
+            fitted = dispersion_screening(dispersion.beta, self.cutoff, dtype)
+            dispersion = dispersion._replace(screening=fitted, strength=strength)
         addends = [switch_term_of(self.truncation, {power: c}, dtype) for power, c in ((12, c12), (6, c6))]
         if kinds > 1:
-            return LennardJonesManyKinds(*head, np.zeros(slots, np.int32), *zeros((2, kinds * slots), dtype), *addends)
+            return LennardJonesManyKinds(
+                *head, np.zeros(slots, np.int32), *zeros((2, kinds * slots), dtype), *addends, dispersion
+            )
         if found := switch_correction_of(self.truncation, {12: c12, 6: -c6}, dtype):
-            return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found)
-        return LennardJonesOneKind(*head, c12, c6, *addends, NO_SWITCH)
+            return LennardJonesOneKind(*head, c12, c6, NO_SWITCH, NO_SWITCH, found, dispersion)
+        return LennardJonesOneKind(*head, c12, c6, *addends, NO_SWITCH, dispersion)
 
 
 class LennardJonesOneKind(NamedTuple):
@@ -55,6 +76,7 @@ class LennardJonesOneKind(NamedTuple):
     addend12: SwitchTerm | tuple[()]  # of c12/r¹² and c6/r⁶
     addend6: SwitchTerm | tuple[()]
     correction: SwitchCorrection | tuple[()]  # used instead of both
+    dispersion: ScreenedDispersion | tuple[()]
 
 
 class LennardJonesManyKinds(NamedTuple):
@@ -69,6 +91,7 @@ class LennardJonesManyKinds(NamedTuple):
     c6: np.ndarray  # (kinds slots,)
     addend12: SwitchTerm | tuple[()]  # of 1/r¹² and 1/r⁶
     addend6: SwitchTerm | tuple[()]
+    dispersion: ScreenedDispersion | tuple[()]
 
 
 def lennard_jones(
@@ -119,6 +142,10 @@ def interactions(parts: SystemParts) -> Interactions:
         potential = lennard_jones(kind, sigma, epsilon, cutoff, forces.truncation, start, forces.mixing, special)
     if not (np.isfinite(potential.c12).all() and np.isfinite(potential.c6).all()):
         raise SceneError(parts.scene.source, [f"sigma_A of {sigma.max():g} Å with epsilon overflows 4 epsilon sigma¹²"])
+    if forces.dispersion != "cutoff":
+        strength = gather_per_molecule([m.dispersion[i] for m, i in zip(species, indices, strict=True)], index)
+        added = screened_dispersion(strength, forces.dispersion_beta_per_A, cutoff, forces.truncation == "shift")
+        potential = potential._replace(dispersion=added)
     names = [
         np.array([f"{m.name}.{m.site_names[i]}" for i in c], object) for m, c in zip(species, indices, strict=True)
     ]
@@ -166,13 +193,42 @@ def _inverse_power(p: int):
 
 @implements(pairs.pair, LennardJonesOneKind, inline=True)
 def _pair_of_one_kind(potential, i, j, r2):
-    return energy_and_force(potential, potential.c12, potential.c6, r2)
+    u, w = energy_and_force(potential, potential.c12, potential.c6, r2)
+    return with_dispersion(potential.dispersion, i, j, r2, u, w)
 
 
 @implements(pairs.pair, LennardJonesManyKinds, inline=True)
 def _pair(potential, i, j, r2):
     at = potential.kind[i] * len(potential.kind) + j
-    return energy_and_force(potential, load(potential.c12, at), load(potential.c6, at), r2)
+    u, w = energy_and_force(potential, load(potential.c12, at), load(potential.c6, at), r2)
+    return with_dispersion(potential.dispersion, i, j, r2, u, w)
+
+
+def screened_dispersion(strength: np.ndarray, beta: float, cutoff: float, shifted: bool) -> ScreenedDispersion:
+    """What is added for sites with c (s,), square root of u Å⁸/ps². shifted : whether it is 0 at the cutoff"""
+    shift = float(-InverseR6(beta).energy(np.array(cutoff))) if shifted else 0.0
+    return ScreenedDispersion(beta, shift, dispersion_screening(beta, cutoff), strength)
+
+
+@chosen_by_type(inline=True)
+def with_dispersion(dispersion, i, j, r2, u, w):
+    """(energy, force/r) with the part of a sum of dispersion, if there is one."""
+    if not is_a(dispersion, ScreenedDispersion):
+        return lambda dispersion, i, j, r2, u, w: (u, w)
+    if isinstance(dispersion.types[3], types.Array):
+
+        def of_many(dispersion, i, j, r2, u, w):
+            return _added(dispersion, dispersion.strength[i] * load(dispersion.strength, j), r2, u, w)
+
+        return of_many
+    return lambda dispersion, i, j, r2, u, w: _added(dispersion, dispersion.strength, r2, u, w)
+
+
+@kernel(inline=True)
+def _added(dispersion, cc, r2, u, w):
+    t = dispersion.screening.scale * r2 - 1.0
+    energy = polynomial(dispersion.screening.energy, t) - dispersion.shift
+    return u + cc * energy, w + cc * polynomial(dispersion.screening.force, t)
 
 
 @chosen_by_type(inline=True)
@@ -241,6 +297,19 @@ def _arrange(slot_potential, potential, order):
         for k in range(len(potential.c12)):
             slot_potential.c12[k * len(order) + slot] = potential.c12[k, potential.kind[i]]
             slot_potential.c6[k * len(order) + slot] = potential.c6[k, potential.kind[i]]
+    _arrange_strengths(slot_potential.dispersion, potential.dispersion, order)
+
+
+@chosen_by_type
+def _arrange_strengths(in_slots, dispersion, order):
+    if not is_a(dispersion, ScreenedDispersion):
+        return lambda in_slots, dispersion, order: None
+
+    def arrange(in_slots, dispersion, order):
+        for slot, i in enumerate(order):
+            in_slots.strength[slot] = dispersion.strength[i]
+
+    return arrange
 
 
 def tail(potential: LennardJones) -> Tail:

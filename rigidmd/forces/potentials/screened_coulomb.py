@@ -56,6 +56,14 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
     return Screening(kind.type(2 / cutoff**2), tuple(map(kind.type, energy)), tuple(map(kind.type, force)))
 
 
+def dispersion_screening(beta: float, cutoff: float, dtype: type = np.float64) -> Screening:
+    """As `screening`, for (1 - g(beta r))/r⁶ of `lennard_jones.ScreenedDispersion`, 1/Å⁶, and its force over r."""
+    kind = np.dtype(dtype)
+    energy = beta**6 * _cut(_series(beta * cutoff, 5), 0.0, kind, ENERGY_STEP)
+    force = 2 * beta**8 * _cut(_series(beta * cutoff, 7), 0.0, kind, FORCE_STEP)
+    return Screening(kind.type(2 / cutoff**2), tuple(map(kind.type, energy)), tuple(map(kind.type, force)))
+
+
 class TabledScreening(NamedTuple):
     """`Screening` with the force over r as a cubic in x = s - k from s = k to k + 1, with s = density r²."""
 
