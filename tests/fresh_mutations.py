@@ -167,8 +167,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F24", "pressure of frozen molecules with Ewald sums: their sites are taken for molecules",
         "forces/ewald/interactions.py",
-        "float(dipole @ dipole) + float((force * arms).sum())",
-        "float(dipole @ dipole)",
+        "of_surface - float((force * arms).sum())",
+        "of_surface",
         ("test_ewald.py::test_frozen_molecules_do_not_press_on_one_another",),
     ),
     Mutation(

@@ -78,8 +78,8 @@ def names(folder):
 # the command
 
 BUILT_IN = [
-    "rdf", "structure_factor", "density_profile", "hydrogen_bonds", "msd", "diffusion", "orientation", "spectrum",
-    "dielectric", "viscosity",
+    "rdf", "structure_factor", "density_profile", "interfaces", "hydrogen_bonds", "msd", "diffusion", "orientation",
+    "spectrum", "dielectric", "viscosity", "surface_tension",
 ]  # fmt: skip
 
 
@@ -90,7 +90,7 @@ def test_all_analyses_of_a_run_by_one_command(copy, capsys):
     found = json.loads((copy / "analysis.json").read_text())["analyses"]
     assert list(found) == BUILT_IN
     left_out = [name for name, entry in found.items() if not entry["curves"] and not entry["values"]]
-    assert left_out == ["viscosity"]
+    assert left_out == ["interfaces", "viscosity", "surface_tension"]
     assert "viscosity: skipped: a viscosity needs at least 20 ps of the pressure tensor; there are 0.2 ps" in text
     files = [name for entry in found.values() for name in entry["files"]]
     assert sorted([*before, "analysis.json", *files]) == names(copy)

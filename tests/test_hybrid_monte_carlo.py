@@ -87,7 +87,7 @@ def test_a_part_of_each_momentum_is_kept():
 
 def test_auto_chooses_step_and_length():
     results, simulation = sampled(
-        {"integrator": "auto", "duration_ps": 3.0}, {"nitrogen_trappe": 24}, 14.0, 0.2, precision="double"
+        {"integrator": "auto", "duration_ps": 60.0}, {"nitrogen_trappe": 24}, 14.0, 0.2, precision="double"
     )
     stage = simulation.scene.stages[0]
     chosen = results.summary["stages"][0]["choice"]
