@@ -129,8 +129,8 @@ def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
     box = barostat_of(system, 0)._replace(coordinate=COUPLINGS[coupling])
     if coupling not in ("anisotropic", "flexible"):
         box = box._replace(pressure=Pressure((9.0,) * 3 + (0.0,) * 3, (9.0,) * 3 + (0.0,) * 3, 1.0))
-    rng = np.random.default_rng(4 if coupling != "lateral" else 6)
-    values = 0.01 * rng.standard_normal(6)
+    rng = np.random.default_rng(4)
+    values = (0.03 if coupling == "lateral" else 0.01) * rng.standard_normal(6)
     strain = np.array([values[c] if c >= 0 else 0.0 for c in COUPLINGS[coupling]])
     after, room = strained(system, engine, box, state, strain)
     h = 0.05
@@ -143,7 +143,7 @@ def test_a_move_and_its_reverse_are_in_balance(liquid, coupling):
     assert again.velocity == pytest.approx(state.velocity, abs=1e-10)
     assert again.cell == pytest.approx(state.cell, abs=1e-12)
     returned = prepared(system, engine, box, after, again, other, h)
-    assert abs(there) > 0.03
+    assert abs(there) > 0.1
     assert there == pytest.approx(-returned, abs=1e-6 * max(1, abs(there)))
 
 
