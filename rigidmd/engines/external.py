@@ -118,7 +118,6 @@ class ExternalEngine(Engine, ABC):
         self.conserves_energy = not (self._stage.has_thermostat or self._stage.has_barostat)
         self._known_state: State | None = None  # the present state of the program
         self._heat_offset = 0.0  # heat in the ledger of a state that was sent, less the heat of the program by then
-        self._moved: State | None = None
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """None: the program itself keeps the variables of its thermostat and barostat."""
@@ -127,7 +126,6 @@ class ExternalEngine(Engine, ABC):
     def advance(self, state: State, integrator: Scheme | Solver, dt: float, until: int, observed: bool = False) -> None:
         keep_time(state, dt)
         self._send(state)
-        self._moved = state
         steps = until - int(state.step[NOW])
         if steps <= 0:
             return
@@ -136,11 +134,6 @@ class ExternalEngine(Engine, ABC):
         state.step[NOW] = until
         state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN]) * dt
         self._known_state = state.copy()
-
-    def snapshot(self) -> State:
-        if self._moved is None:
-            raise ValueError("this engine has moved no state yet")
-        return self._moved.copy()
 
     def forget(self) -> None:
         self._known_state = None

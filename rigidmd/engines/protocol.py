@@ -89,10 +89,6 @@ class Engine(Protocol):
         """Steps that a solver has chosen itself, and its evaluations of forces."""
 
     @abstractmethod
-    def snapshot(self) -> State:
-        """An exact copy of the state that was last moved."""
-
-    @abstractmethod
     def memory(self) -> dict[str, np.ndarray] | None:
         """The arrays besides the state on which the next steps depend; None if arrays cannot hold all of it."""
 

@@ -205,11 +205,6 @@ class CpuEngine(Engine):
         by_term = [Tally(energy, virial) for energy, virial in zip(tallies[:, 0].tolist(), virials, strict=True)]
         return Load(load.force.copy(), load.torque_body.copy()), dict(zip(self.names, by_term, strict=False))
 
-    def snapshot(self) -> State:
-        if self._moved is None:
-            raise ValueError("this engine has moved no state yet")
-        return self._moved.copy()
-
     def memory(self) -> dict[str, np.ndarray] | None:
         """Neighbour lists as last built, forces at the present positions, and the memory of the barostat."""
         owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}

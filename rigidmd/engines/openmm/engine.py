@@ -122,7 +122,6 @@ class OpenmmEngine(ExternalEngine):
             except library().OpenMMException as error:
                 raise ValueError(f"OpenMM cannot resume from its checkpoint: {error}") from None
             self._known_state, (self._heat_offset,) = state.copy(), memory["heat"].tolist()
-        self._moved = state
 
     def close(self) -> None:
         for name in ("_moving_context", "_evaluating_context", "_integrator"):
