@@ -285,13 +285,12 @@ ENGINES = {"rigidmd": Rigidmd, "gromacs": Gromacs, "openmm": OpenMM, "lammps": L
 
 
 def openmm_system(sites: dict, cutoff: float, switch: float | None):
-    """A system of rigid molecules in a cube and its NonbondedForce. cutoff in nm; switch : width of the switch before it, Å"""
+    """A system of rigid molecules in a box and its NonbondedForce. cutoff in nm; switch : width of the switch before it, Å"""
     import openmm
 
     n, s = sites["position"].shape[:2]
     system, force = openmm.System(), openmm.NonbondedForce()
-    edge = float(sites["edge"]) / 10
-    system.setDefaultPeriodicBoxVectors((edge, 0, 0), (0, edge, 0), (0, 0, edge))
+    system.setDefaultPeriodicBoxVectors(*np.diag(sites["edges"] / 10))
     force.setCutoffDistance(cutoff)
     if switch:
         force.setUseSwitchingFunction(True)
@@ -318,7 +317,7 @@ def sites_of(system, state) -> dict:
     return {
         "position": system.site_positions(state, wrapped=True).reshape(len(state.position), -1, 3),
         "template": species.positions_body,
-        "edge": np.array(state.cell[0, 0]),
+        "edges": state.cell.diagonal(),
         "name": np.array(species.site_names),
         "mass": species.masses,
         "charge": species.charges,
@@ -351,7 +350,7 @@ def gro(sites: dict, velocity: np.ndarray) -> str:
         numbers = "".join(f"{x / 10:14.9f}" for x in sites["position"][m, k])
         numbers += "".join(f"{x / 10:14.10f}" for x in velocity[m, k])
         lines.append(f"{(m + 1) % 100000:5d}{'MOL':5s}{sites['name'][k]:>5s}{(i + 1) % 100000:5d}{numbers}")
-    return "\n".join([*lines, " ".join([f"{float(sites['edge']) / 10:.10f}"] * 3)]) + "\n"
+    return "\n".join([*lines, " ".join(f"{edge / 10:.10f}" for edge in sites["edges"])]) + "\n"
 
 
 def top(sites: dict) -> str:
@@ -383,9 +382,8 @@ def top(sites: dict) -> str:
 def lammps_data(sites: dict) -> str:
     """A LAMMPS data file, units real, atom_style full; a type a site. Velocities in Å/fs."""
     n, s = sites["position"].shape[:2]
-    edge = float(sites["edge"])
     lines = ["start", "", f"{n * s} atoms", f"{s} atom types", ""]
-    lines += [f"0 {edge!r} {axis}lo {axis}hi" for axis in "xyz"]
+    lines += [f"0 {float(edge)!r} {x}lo {x}hi" for x, edge in zip("xyz", sites["edges"], strict=True)]
     lines += ["", "Masses", "", *(f"{k + 1} {mass}" for k, mass in enumerate(sites["mass"])), "", "Atoms # full", ""]
     for i in range(n * s):
         m, k = divmod(i, s)

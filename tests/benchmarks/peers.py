@@ -98,6 +98,13 @@ class Workload:
     timesteps: tuple[float, ...]  # of accuracy unless others are asked for, fs
     reference: str  # file of --start reference
     pme: bool = False  # smooth particle mesh Ewald in place of the reaction field
+    liquid: float | None = None  # height of a slab in a box of edges (edge, edge, height); None for a cube of liquid
+    height: float | None = None
+
+    @property
+    def edges(self) -> list[float]:
+        """The edges of its box."""
+        return [self.edge, self.edge, self.height or self.edge]
 
     @property
     def charged(self) -> bool:
@@ -114,7 +121,7 @@ class Workload:
             field = {"electrostatics": "reaction_field", "reaction_field_permittivity": self.permittivity,
                      "reaction_field_truncation": truncation}  # fmt: skip
         whole = {
-            "box": {"lengths_A": self.edge},
+            "box": {"lengths_A": self.edges},
             "molecules": [{**self.molecules, "count": self.count}],
             "forces": {"cutoff_A": self.cutoff, "truncation": truncation, "tail_correction": False, **start, **field},
             "precision": "double",
@@ -130,6 +137,8 @@ WORKLOADS = {
                    {"model": "spce"}, 4096, 49.71859932, 298.0, 9.0, 78.5, 10, (1.0, 2.0, 4.0), "water4096.npz"),
     "W2": Workload("4096 SPC/E waters, 298 K, box 49.72 Å; cut-off 9 Å, PME",
                    {"model": "spce"}, 4096, 49.71859932, 298.0, 9.0, 78.5, 20, (1.0, 2.0, 4.0), "water4096.npz", True),
+    "W4": Workload("slab of 1000 SPC/E waters, 298 K, box 30 x 30 x 100 Å; cut-off 12 Å, PME",
+                   {"model": "spce"}, 1000, 30.0, 298.0, 12.0, 78.5, 20, (1.0, 2.0, 4.0), "", True, 33.3, 100.0),
     "W3": Workload("4000 two-centre Lennard-Jones N2, 77 K, box 61.49 Å; cut-off 10 Å",
                    NITROGEN_14, 4000, 61.48829937, 77.0, 10.0, 1.0, 40, (2.0, 4.0, 8.0), "n2_4000.npz"),
 }  # fmt: skip
@@ -210,6 +219,10 @@ class Start:
 def grow(work: Workload, folder: Path) -> None:
     """A start of one's own, folder/start.npz: a small box from lattice to liquid, copies of it, and 2 ps more."""
     quiet = {"thermostat_time_ps": 0.1, "ensemble": "nvt", "temperature_K": work.temperature, "timestep_fs": 2.0}
+    if work.height and work.liquid:
+        box = {"lengths_A": [work.edge, work.edge, work.liquid], "vacuum_A": work.height - work.liquid}
+        slab = work.scene(structure=None, box=box, stages=[quiet | {"duration_ps": 20.0}])
+        return write_start(folder, work, *Simulation(Scene.from_dict(slab)).run().state[:4])
     small = work.scene(
         structure=None,
         box={"lengths_A": work.edge / COPIES},
@@ -248,7 +261,7 @@ def write_start(folder: Path, work: Workload, position, velocity, rotation, mome
     """A state as `[structure] file` reads it (output/state.py); the box is that of the workload unless given."""
     names = [work.molecules.get("model") or work.molecules["name"]]
     np.savez(folder / "start.npz", species_names=np.array(names), species=np.zeros(len(position), np.int64),
-             cell=np.eye(3) * (edge or work.edge), position=position, velocity=velocity, rotation=rotation,
+             cell=np.diag([edge] * 3 if edge else work.edges), position=position, velocity=velocity, rotation=rotation,
              angular_momentum_body=momentum_body)  # fmt: skip
 
 
@@ -311,12 +324,12 @@ def ewald_forces(work: Workload, folder: Path) -> np.ndarray:
 def damped_shifted(sites: dict, cutoff: float) -> float:
     """Energy (kJ/mol) of Fennell & Gezelter 2006, J. Chem. Phys. 124, 234104, eq. 19, with LAMMPS's own energy."""
     n, s = sites["position"].shape[:2]
-    edge = float(sites["edge"])
-    points = np.mod(sites["position"].reshape(-1, 3), edge)
-    i, j = cKDTree(points, boxsize=edge).query_pairs(cutoff, output_type="ndarray").T
+    edges = sites["edges"]
+    points = np.mod(sites["position"].reshape(-1, 3), edges)
+    i, j = cKDTree(points, boxsize=edges).query_pairs(cutoff, output_type="ndarray").T
     i, j = i[i // s != j // s], j[i // s != j // s]
     step = points[i] - points[j]
-    r = np.linalg.norm(step - edge * np.round(step / edge), axis=1)
+    r = np.linalg.norm(step - edges * np.round(step / edges), axis=1)
     charge = np.tile(sites["charge"], n)
     at = erfc(DSF_ALPHA * cutoff) / cutoff
     gaussian = 2 * DSF_ALPHA / np.sqrt(np.pi) * np.exp(-((DSF_ALPHA * cutoff) ** 2))
@@ -630,13 +643,13 @@ def arguments() -> argparse.Namespace:
         "--workloads",
         type=choice(WORKLOADS),
         default=list(WORKLOADS),
-        help="W1 (SPC/E), W2 (SPC/E with PME), W3 (N2); all",
+        help="W1 (SPC/E), W2 (SPC/E with PME), W3 (N2), W4 (a slab of SPC/E with PME); all",
     )
     add("--engines", type=choice(ENGINES), default=list(ENGINES), help=f"of {','.join(ENGINES)}; all")
     add("--cores", type=numbers(int), default=[1, 2], help="of speed; 1,2")
     add("--accuracy-cores", type=int, help="of accuracy; the largest of --cores")
     add("--steps", type=numbers(float), help="time steps of accuracy in fs, those of the scheme with one force a step; "
-        "1,2,4 for W1 and W2, 2,4,8 for W3")  # fmt: skip
+        "1,2,4 for W1, W2 and W4, 2,4,8 for W3")  # fmt: skip
     add("--rounds", type=int, default=3, help="of speed; 3")
     add("--seconds", type=float, default=15.0, help="of computing in a run of accuracy, a third in one of speed; 15")
     add("--tries", type=int, default=1, help="how often a run on several cores is repeated at most while other programs "
