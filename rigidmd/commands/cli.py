@@ -17,6 +17,7 @@ import rigidmd.commands as package
 from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
 from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
+from rigidmd.core.plain_text import did_you_mean
 from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
 
 EXAMPLES = """examples:
@@ -78,14 +79,10 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser, commands = _parser()
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
-        from rigidmd.scene.validation import did_you_mean  # not before it is needed: it loads pydantic
-
-        suggestion = did_you_mean(name, dict.fromkeys(commands)) or "; `rigidmd --help` lists them"
+        suggestion = did_you_mean(name, commands) or "; `rigidmd --help` lists them"
         parser.error(f"unknown command {name!r}{suggestion}")
     options, unknown = parser.parse_known_args(words)
     if unknown and name is not None:
-        from rigidmd.scene.validation import did_you_mean
-
         known = dict.fromkeys(re.findall(r"(?<![\w-])--[a-z-]+", commands[name].format_help()))
         suggestion = did_you_mean(unknown[0].partition("=")[0], known)
         commands[name].error(f"unknown argument {unknown[0]!r}{suggestion}")

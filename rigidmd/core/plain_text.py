@@ -1,7 +1,9 @@
-"""Names and paths of users, made safe for generated files that are code."""
+"""Names of users: made safe for generated files that are code, made distinct, and compared with known names."""
 
+import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
+from itertools import chain, count
 
 #: Line ends, control characters and characters that Slurm interprets within quotes: not allowed in paths of scripts.
 UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\"\\]")
@@ -17,13 +19,54 @@ def as_word(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.+*'-]", "_", text) or "_"
 
 
-def distinct(texts: Sequence[str]) -> list[str]:
-    """Texts as distinct identifiers."""
-    found: list[str] = []
-    for text in texts:
-        name, n = re.sub("[^A-Za-z0-9_]", "_", text) or "_", 1
-        stem = name
-        while name in found:
-            name, n = f"{stem}_{n + 1}", n + 1
-        found.append(name)
-    return found
+def as_identifier(text: str) -> str:
+    """A text as a word of letters, digits and underscores."""
+    return re.sub("[^A-Za-z0-9_]", "_", text) or "_"
+
+
+def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    """Names with numbers where they would be equal to others or taken: a, a_2."""
+    found = list(taken)
+    first = len(found)
+    for name in names:
+        numbered = (f"{name}_{k}" for k in count(2))
+        found.append(next(one for one in chain([name], numbered) if one not in found))
+    return found[first:]
+
+
+#: With more similar names than this, no suggestion is made from a common beginning or end.
+MOST_SUGGESTIONS = 8
+#: Limits of length and number of names beyond which none is suggested, because the comparison would take long.
+LONGEST_NAME, MOST_NAMES = 60, 1000
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
+    return suggestion(similar_names(name, known))
+
+
+def suggestion(names: list[str]) -> str:
+    """'; did you mean ...?' for these names; empty for none."""
+    return f"; did you mean {' or '.join(names)}?" if names else ""
+
+
+def similar_names(name: str, known: Iterable[str]) -> list[str]:
+    """Known names that an unknown one may stand for: those that differ only in case and punctuation; else those that
+    begin with it, such as a key without its unit, or end with it; else the one with the most similar spelling."""
+    known = list(known)
+    if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
+        return []
+    plain = {key: plain_letters(key) for key in known}
+    asked = plain_letters(name)
+    near = [key for key, letters in plain.items() if letters == asked]
+    near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
+    near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
+    if not near or len(near) > MOST_SUGGESTIONS:
+        alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
+        near = [key for key, letters in plain.items() if letters in alike]
+    return near
+
+
+def plain_letters(name: str) -> str:
+    """The letters and digits of a name in lower case, which are enough to recognise it."""
+    return re.sub(r"[\W_]", "", name).lower()

@@ -1,6 +1,5 @@
 """Files that are shipped with the package: example scenes, notebooks, scripts, chapters of the documentation."""
 
-import difflib
 import json
 import re
 import shutil
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidmd.core.files import atomic_file, writing
+from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.errors import InputError, OutputError
 
 PACKAGE = Path(__file__).parent.parent
@@ -77,10 +77,9 @@ def find_example(name: str) -> Example:
     if series := series_of(name):
         return known[series[0]]
     stem = Path(name).stem
-    near = [other for other in known if other == stem or other.startswith(f"{stem}_")]
-    near = near or difflib.get_close_matches(stem, known, 3, 0.6)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise InputError("examples", [f"unknown scene {name!r}; {hint}`rigidmd examples` lists all {len(known)}"])
+    near = [other for other in known if f"{other}_".startswith(f"{stem}_")] or similar_names(stem, known)
+    hint = suggestion(near) or ";"
+    raise InputError("examples", [f"unknown scene {name!r}{hint} `rigidmd examples` lists all {len(known)}"])
 
 
 def series_of(name: str) -> list[str]:
@@ -118,12 +117,11 @@ def contents() -> dict[str, dict[str, str]]:
 def chapter_text(name: str) -> str:
     """A chapter as plain text, without comments; pictures become name and path. Raises InputError."""
     if name not in CHAPTERS:
-        hint = "".join(f"did you mean {near}? " for near in difflib.get_close_matches(name, CHAPTERS, 1, 0.6))
         word = re.compile(rf"\b{re.escape(name)}", re.IGNORECASE)
         found = {chapter: len(word.findall(_plain(chapter))) for chapter in CHAPTERS if chapter != "changelog"}
         named = [f"{chapter} ({count})" for chapter, count in found.items() if count]
         where = f"the word is in {', '.join(named)}" if named else f"there are {', '.join(CHAPTERS)}"
-        raise InputError("help", [f"unknown chapter {name!r}; {hint}{where}"])
+        raise InputError("help", [f"unknown chapter {name!r}{did_you_mean(name, CHAPTERS) or ';'} {where}"])
     return _plain(name)
 
 

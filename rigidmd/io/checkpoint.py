@@ -62,8 +62,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
             arrays = {name: data[name] for name in data.files if name != CONTENTS}
         values = json.loads(arrays.pop(JSON).tobytes())
         schema = int(values.pop("schema"))
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: the file does not exist") from None
     except Exception as error:  # zipfile, zlib, numpy and json refusals all mean the same to the user
         raise CheckpointError(f"{path}: is damaged, or not a checkpoint: {error}") from None
     if schema != SCHEMA:

@@ -12,7 +12,7 @@ from rigidmd.core.files import atomic_file, write_text
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import STRUCTURE
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.scene.models import LENNARD_JONES, MoleculeFile, Site
+from rigidmd.scene.models import MoleculeFile
 
 
 def input_names(scene: Scene) -> dict[str, str]:
@@ -55,27 +55,18 @@ TO_FILL_IN = """# Sites have masses only and do not interact. Add the parameters
 def write_model(path: Path, model: MoleculeFile) -> None:
     """Write a model, which is read back to the same bits. Raises OutputError."""
     idle = all(site.charge_e is None and site.sigma_A is None and not site.parameters for site in model.sites)
-    head = [f"{key} = {_text(value)}" for key in ("name", "title", "source", "note") if (value := getattr(model, key))]
-    if model.residue_names:
-        head.append(f"residue_names = [{', '.join(map(_text, model.residue_names))}]")
-    lines = [*([TO_FILL_IN] if idle else []), *head, *(f"\n{_site(site)}" for site in model.sites), ""]
-    write_text(path, "\n".join(lines))
+    data = model.model_dump(exclude_defaults=True)
+    sites = data.pop("sites")
+    tables = [_lines(data), *(f"\n[[sites]]\n{_lines(site)}" for site in sites)]
+    write_text(path, "\n".join([*([TO_FILL_IN] if idle else []), *tables, ""]))
 
 
-def _site(site: Site) -> str:
-    lines = ["[[sites]]", f"name = {_text(site.name)}"]
-    if site.element != "X":
-        lines.append(f"element = {_text(site.element)}")
-    for key in ("mass_u", "position_A", "charge_e", *LENNARD_JONES):
-        value = getattr(site, key)
-        if value is not None:
-            text = f"[{', '.join(map(repr, value))}]" if isinstance(value, tuple) else repr(value)
-            lines.append(f"{key} = {text}")
-    if site.parameters:
-        items = ", ".join(f"{_text(name)} = {value!r}" for name, value in site.parameters.items())
-        lines.append(f"parameters = {{ {items} }}")
-    return "\n".join(lines)
+def _lines(table: dict[str, Any]) -> str:
+    return "\n".join(f"{key} = {_value(value)}" for key, value in table.items())
 
 
-def _text(value: str) -> str:
+def _value(value: Any) -> str:
+    """A text, a number, a list or a table in one line, which TOML writes as JSON except for tables."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_value(name)} = {_value(inner)}' for name, inner in value.items())} }}"
     return json.dumps(value, ensure_ascii=False)

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, Valida
 from rigidmd.core.display import Displayed
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.integrators import SCHEMES, Scheme
+from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
     DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
@@ -20,8 +21,7 @@ from rigidmd.errors import SceneError
 from rigidmd.io.formats import Format, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
-    MOST_TABLES, Section, did_you_mean, exact_names, location_of, numbers_out_of_range, similar_names, suggestion,
-    validation_messages,
+    MOST_TABLES, Section, exact_names, is_within, location_of, numbers_out_of_range, validation_messages,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -93,19 +93,19 @@ class Scene(Section, Displayed):
         return self._folder / file
 
     @property
+    def named_files(self) -> dict[str, str]:
+        """The other files that the scene reads: dotted key -> name in the scene."""
+        return {}
+
+    @property
     def inputs(self) -> dict[str, Path]:
         """The other files that the scene reads: dotted key -> path."""
-        return {}
+        return {key: self.path(name) for key, name in self.named_files.items()}
 
     @property
     def embedded_files(self) -> dict[str, bytes]:
         """Inputs that are not on disk: dotted key of the file's name -> content. A run writes them to its folder."""
         return self._embedded_files
-
-    @classmethod
-    def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        """Messages on files of a scene that lie outside its folder."""
-        return []
 
     @classmethod
     def contradictions(cls, data: dict[str, Any], text: str) -> list[str]:
@@ -161,8 +161,7 @@ class Scene(Section, Displayed):
         kind = cls if issubclass(cls, (BodyScene, MolecularScene)) else _kind_of_scene(data, BodyScene, MolecularScene)
         if kind is None:
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
-        faults = [] if embedded_files else kind.paths_outside_folder(data, folder)
-        overridden = []
+        faults, overridden = [], []
         for named, value in overrides.items():
             key, wrong = _override(data, named, value)
             faults += wrong
@@ -185,9 +184,13 @@ class Scene(Section, Displayed):
             raise SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in faults])
         scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
         for key, path in scene.inputs.items():
-            if fault := unreadable_reason(path):
-                keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
-                where = location_of(keys, text, overridden)
+            keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
+            where = location_of(keys, text, overridden)
+            if not (embedded_files or is_within(key, overridden) or _is_inside(path, folder)):
+                advice = f"move it there, or set it by --set {key}=PATH"
+                name = shorten_repr(scene.named_files[key])
+                faults.append(f"{where}: {name} is outside the scene's folder; {advice}")
+            elif fault := unreadable_reason(path):
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         if faults:
             raise SceneError(source, faults)
@@ -207,6 +210,14 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
 def default_name(path: Path) -> str:
     """The name of a scene whose file sets none."""
     return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    """Whether a path is inside a folder. True for a path that cannot be resolved, which is missing."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a name that is too long, a loop of links, a zero byte
+        return True
 
 
 def _similar_files(path: Path, suffix: str = "") -> str:
@@ -269,7 +280,7 @@ def _has_key(data: Any, key: str) -> bool:
 def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, with numbers for names
     of entries of lists, and error messages."""
-    if key in ("structure.file", "structure.topology") or re.fullmatch(r"molecules\.[^.]+\.(file|parameters)", key):
+    if re.fullmatch(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)", key):
         value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)
     if len(parents) > DEEPEST:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 
 from pydantic import Field, PrivateAttr, Strict
 
-from rigidmd.core.toml import shorten_repr
+from rigidmd.core.plain_text import distinct
 from rigidmd.errors import SceneError
 from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name
@@ -28,19 +28,9 @@ class UserCode(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Unique names of all objects."""
+        """Distinct names of all objects."""
         thermostat = () if self.thermostat is None else (f"thermostat {name_of(self.thermostat)}",)
-        return (*self.force_names(), *thermostat)
-
-    def force_names(self, taken: Sequence[str] = ()) -> list[str]:
-        """A name for each force, with a number where it would not be unique."""
-        found = list(taken)
-        for force in self.forces:
-            name, k = name_of(force), 1
-            while (unique := name if k == 1 else f"{name}_{k}") in found:
-                k += 1
-            found.append(unique)
-        return found[len(taken) :]
+        return (*distinct(map(name_of, self.forces)), *thermostat)
 
 
 def name_of(thing: Any) -> str:
@@ -224,7 +214,7 @@ class MolecularScene(Scene):
         return next((stage for stage in self.stages if not stage.is_minimisation), None)
 
     @property
-    def inputs(self) -> dict[str, Path]:
+    def named_files(self) -> dict[str, str]:
         found: dict[str, str | None] = {}
         if self.structure is not None and "structure.file" not in self.embedded_files:
             found["structure.file"] = self.structure.file
@@ -233,7 +223,7 @@ class MolecularScene(Scene):
             found |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
         for k, force in enumerate(self.forces.custom):
             found |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
-        return {key: self.path(name) for key, name in found.items() if name is not None}
+        return {key: name for key, name in found.items() if name is not None}
 
     @property
     def structure_source(self) -> str:
@@ -348,28 +338,3 @@ class MolecularScene(Scene):
                     f"output.trajectory: a {kind} file stores one time between frames, and stages.{k} cannot keep "
                     f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
                 )
-
-    @classmethod
-    def paths_outside_folder(cls, data: dict[str, Any], folder: Path) -> list[str]:
-        forces = data.get("forces")
-        custom = forces.get("custom") if isinstance(forces, dict) else None
-        tables = {"structure": (data.get("structure"), ("file", "topology"))}
-        lists = {"molecules": (data.get("molecules"), SPECIES_FILES), "forces.custom": (custom, FORCE_FILES)}
-        for name, (entries, keys) in lists.items():
-            for k, entry in enumerate(entries if isinstance(entries, list) else ()):
-                tables[f"{name}.{k}"] = entry, keys
-        given = [(name, table, key) for name, (table, keys) in tables.items() for key in keys]
-        named = {f"{name}.{key}": table.get(key) for name, table, key in given if isinstance(table, dict)}
-        return [
-            f"{key}: {shorten_repr(file)} is outside the scene's folder; move it there, or set it by --set {key}=PATH"
-            for key, file in named.items()
-            if isinstance(file, str) and not _is_inside(folder / file, folder)
-        ]
-
-
-def _is_inside(path: Path, folder: Path) -> bool:
-    """Whether a path is inside a folder. True for a path that cannot be resolved, which is missing."""
-    try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # a name that is too long, a loop of links, a zero byte
-        return True

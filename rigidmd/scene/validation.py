@@ -1,7 +1,6 @@
 """Validation of input tables: strict value types for pydantic, and its errors as messages with key and line."""
 
 import ast
-import difflib
 import inspect
 import re
 import tomllib
@@ -15,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, ValidationInfo, model_validator
 from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
+from rigidmd.core.plain_text import did_you_mean, plain_letters
 from rigidmd.core.toml import line_of, shorten_repr, shorten_text
 from rigidmd.errors import MOST_SHOWN
 
@@ -32,11 +32,6 @@ FOREIGN_KEYS = Path(__file__).with_name("foreign_keys.toml")
 
 #: Largest number of tables in a list of tables.
 MOST_TABLES = 1000
-
-#: With more similar names than this, no suggestion is made from a common beginning or end.
-MOST_SUGGESTIONS = 8
-#: Limits of length and number of names beyond which none is suggested, because the comparison would take long.
-LONGEST_NAME, MOST_NAMES = 60, 1000
 
 
 def _add_docstrings(schema: dict[str, Any], kind: type[BaseModel]) -> None:
@@ -147,10 +142,15 @@ def _either(sentences: list[str]) -> str:
 def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
     """Where a key of a scene is set: its line and name, or "--set KEY"."""
     path = ".".join(shorten_text(str(key)) for key in keys)
-    if any(f"{path}.".startswith(f"{key}.") for key in overridden):
+    if is_within(path, overridden):
         return f"--set {path}"
     line = line_of(keys, text)
     return (f"line {line}: " if line else "") + (path or "scene")
+
+
+def is_within(path: str, keys: Iterable[str]) -> bool:
+    """Whether a dotted path is one of these keys, or inside the table of one."""
+    return any(f"{path}.".startswith(f"{key}.") for key in keys)
 
 
 #: A part of a location of pydantic that names the branch of a union.
@@ -206,7 +206,7 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
         section, path = model.model_fields.get(table), [] if table == "scene" else [table]
         for key, text in entries.items():
             names, _, note = text.partition(": ")
-            if _plain(name) not in map(_plain, names.split()):
+            if plain_letters(name) not in map(plain_letters, names.split()):
                 continue
             if table == "none" and "stages" in model.model_fields:
                 return f"; not needed: {note}"
@@ -214,37 +214,6 @@ def _foreign(name: str, model: type[BaseModel]) -> str:
                 place = f" in [[{table}]]" if "tuple" in str(section) else f" in [{table}]" if path else ""
                 return f"; in rigidmd this is {key}{place}{note and f' ({note})'}"
     return ""
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """'; did you mean ...?' for an unknown name; empty if no known name is similar."""
-    return suggestion(similar_names(name, known))
-
-
-def suggestion(names: list[str]) -> str:
-    """'; did you mean ...?' for these names; empty for none."""
-    return f"; did you mean {' or '.join(names)}?" if names else ""
-
-
-def similar_names(name: str, known: Iterable[str]) -> list[str]:
-    """Known names that an unknown one may stand for: those that differ only in case and punctuation; else those that
-    begin with it, such as a key without its unit, or end with it; else the one with the most similar spelling."""
-    known = list(known)
-    if len(name) > LONGEST_NAME or len(known) > MOST_NAMES:
-        return []
-    plain = {key: _plain(key) for key in known}
-    asked = _plain(name)
-    near = [key for key, letters in plain.items() if letters == asked]
-    near = near or [key for key, letters in plain.items() if asked and letters.startswith(asked)]
-    near = near or [key for key, letters in plain.items() if asked and letters.endswith(asked)]
-    if not near or len(near) > MOST_SUGGESTIONS:
-        alike = difflib.get_close_matches(asked, plain.values(), 1, 0.6)
-        near = [key for key, letters in plain.items() if letters in alike]
-    return near
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[\W_]", "", name).lower()
 
 
 def _known_keys(model: type[BaseModel], keys: list) -> list[str]:
@@ -263,7 +232,7 @@ def exact_names(data: Any, annotation: Any) -> Any:
     """Data of a type in which values with a fixed choice have their exact spelling: "NVT" becomes "nvt". The case of
     letters, hyphens, underscores and slashes do not matter in scenes."""
     if isinstance(data, str):
-        near = [name for name in _choices(annotation) if _plain(name) == _plain(data)]
+        near = [name for name in _choices(annotation) if plain_letters(name) == plain_letters(data)]
         return near[0] if len(near) == 1 else data
     if isinstance(data, list):
         return [exact_names(value, annotation) for value in data]

@@ -14,14 +14,14 @@ from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
 from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
+from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import Tail, sum_of_tails
-from rigidmd.scene.molecules import UserCode, name_of
-from rigidmd.scene.validation import did_you_mean
+from rigidmd.scene.molecules import name_of
 
 if TYPE_CHECKING:
     from rigidmd.engines.system import System
@@ -64,14 +64,7 @@ def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
             raise ValueError(f"{entry.name}(...) raised {describe_error(error)}") from error
     elif entry.parameters:
         raise ValueError(f"parameters would do nothing: {entry.name} is an object, which is not called")
-    return _Named(entry.name, made)
-
-
-class _Named(NamedTuple):
-    """An object and its name in the scene."""
-
-    name: str
-    made: Any
+    return made
 
 
 @contextmanager
@@ -99,14 +92,14 @@ def user_errors_explained(system: "System") -> Iterator[None]:
 
 def with_user_code(system: "System") -> "System":
     """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError with all errors."""
-    scene, thermostat = system.scene, system.scene.user_code.thermostat
-    user_code = UserCode((*custom_forces(scene), *scene.user_code.forces))
-    names = user_code.force_names([*system.terms, *system.constants])
+    scene, (added, thermostat) = system.scene, system.scene.user_code
+    forces = [*custom_forces(scene), *added]
+    wanted = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
+    names = distinct(wanted, [*system.terms, *system.constants])
     found = replace(system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes])
     terms, tails, faults = {}, [] if system.tail is None else [system.tail], []
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
-    for name, given in zip(names, user_code.forces, strict=True):
-        made = given.made if isinstance(given, _Named) else given
+    for name, made in zip(names, forces, strict=True):
         try:
             term = _term(made, name, system, found, tails)
             if not isinstance(term, PairForces):

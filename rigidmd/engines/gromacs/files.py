@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import erfc
 
 from rigidmd.core.files import write_text
-from rigidmd.core.plain_text import as_word, distinct, in_comment
+from rigidmd.core.plain_text import as_identifier, as_word, distinct, in_comment
 from rigidmd.core.state import State
 from rigidmd.engines.external import SPLIT, Key, Limit, Missing, Translations, moves
 from rigidmd.engines.force_field import ForceFieldView
@@ -94,7 +94,7 @@ def write_gromacs(folder: Path, view: ForceFieldView, state: State) -> list[str]
     """Write the files for a system that begins at a state, and return their names. Raises OutputError."""
     bodies = [gromacs_points(m) for m in view.system.species]
     stages = [(k, stage) for k, stage in enumerate(view.system.scene.stages) if not stage.is_minimisation]
-    names = distinct([f"{n}_{stage.label}" for n, (_, stage) in enumerate(stages, 1)])
+    names = distinct([as_identifier(f"{n}_{stage.label}") for n, (_, stage) in enumerate(stages, 1)])
     script = ["#!/bin/sh", "# Written by rigidmd: runs the stages with GROMACS, one after the other.", "set -e"]
     before = f"-c {COORDINATES}"
     for name in map(quote, names):
@@ -158,7 +158,7 @@ def _topology(view: ForceFieldView, bodies: list[MassPoints]) -> str:
     lines += ["", "[ nonbond_params ]", "; i j func sigma_nm epsilon_kJ_mol"]
     pairs = [(i, j) for i in range(len(kinds)) for j in range(i, len(kinds))]
     lines += [f"K{i + 1} K{j + 1} 1 {sigma[i, j]:.12g} {epsilon[i, j]:.12g}" for i, j in pairs]
-    index, names = system.model.species, distinct([m.name for m in system.species])
+    index, names = system.model.species, distinct([as_identifier(m.name) for m in system.species])
     for k in sorted(set(index.tolist())):
         start = int(np.searchsorted(system.sites.molecule, int(np.flatnonzero(index == k)[0])))
         kind = view.kind[start : start + len(system.species[k].masses)]

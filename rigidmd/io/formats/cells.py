@@ -127,15 +127,12 @@ def pairs_within(
         inside = position @ inverse
         inside -= np.floor(inside)
         margin = radius * np.linalg.norm(inverse, axis=0)  # in fractional coordinates
-        shifts = product(*(range(-int(np.ceil(m)), int(np.ceil(m)) + 1) for m in margin))
-        faces = np.flatnonzero(((inside <= margin) | (inside >= 1 - margin)).any(axis=1))
-        owners, images = [owner], [inside]
-        for shift in shifts:
-            if any(shift):
-                image = inside[faces] + shift
-                near = ((image >= -margin) & (image <= 1 + margin)).all(axis=1)
-                owners.append(faces[near])
-                images.append(image[near])
-        owner, points = np.concatenate(owners), np.concatenate(images) @ cell
+        images = []
+        for shift in product(*(range(-n, n + 1) for n in np.ceil(margin).astype(int))):
+            image = inside + shift
+            near = np.flatnonzero(((image >= -margin) & (image <= 1 + margin)).all(axis=1))
+            images.append((near, image[near]))
+        owner, points = (np.concatenate(parts) for parts in zip(*images, strict=True))
+        points = points @ cell
     i, j = KDTree(points).query_pairs(radius, output_type="ndarray").T
     return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)
