@@ -2,6 +2,7 @@
 
 # isort: skip_file
 from collections import Counter
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
 from rigidmd.io.structure_file import read_atoms, read_geometry
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.models import (
-    Molecule, MoleculeFile, Site, find_site, load_model, molecule, read_molecule, read_parameters, with_masses,
-    with_parameters,
+    Molecule, MoleculeFile, Site, find_site, load_model, molecule, molecule_of, read_molecule, read_parameters,
+    with_masses, with_parameters,
 )  # fmt: skip
 from rigidmd.scene.species import Molecules, spans
 from rigidmd.scene.validation import ValidationError, not_none, validation_messages
@@ -53,7 +54,7 @@ def _one_species(scene: MolecularScene, entry: Molecules) -> Molecule:
     if entry.masses_u is not None:
         found = with_masses(found, entry.masses_u)
     changed = {"name": entry.name or found.name, "residue_names": entry.residue_names or found.residue_names}
-    return Molecule(**{**vars(found), **changed})
+    return replace(found, **changed)
 
 
 def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ...], where: str) -> tuple[Site, ...]:
@@ -140,7 +141,7 @@ def model_from_geometry(
         file = MoleculeFile.model_validate(data | {"residue_names": tuple(residues), "sites": sites})
     except ValidationError as error:
         raise MoleculeError(str(geometry), validation_messages(error, MoleculeFile)) from None
-    found = molecule(file.name, file.sites, file.title, file.source, file.residue_names)
+    found = molecule_of(file)
     notes += _one_molecule(geometry, atoms, elements)
     whole = round(found.charge)
     off = abs(found.charge - whole)

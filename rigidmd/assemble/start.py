@@ -168,23 +168,14 @@ def close_pairs(
 ) -> list[tuple[int, int, float]]:
     """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances, Å. `wanted` are
     radii, and functions for the indices of the sites of a molecule to which they apply."""
-    species, reach = system.species, 0.0
-    for radius, sites_of in wanted:
-        arm = max(np.linalg.norm(m.positions_body[sites_of(m)], axis=1).max(initial=0.0) for m in species)
-        reach = max(reach, radius + 2 * arm if arm <= system.smallest_diameter else inf)
-    crowded, cell = np.arange(len(state.position)), state.cell if state.volume < inf else None
-    if reach < inf:  # few centres are so close; a search among all sites would take five times as long
-        crowded = np.unique(np.concatenate(pairs_within(state.position, cell, reach)[:2]))
-    kinds, counts, free = system.model.species[crowded], system.sites_per_molecule, mobile(system.model)
+    cell = state.cell if state.volume < inf else None
+    position, owner, free = system.site_positions(state), system.sites.molecule, mobile(system.model)
     near: dict[tuple[int, int], float] = {}
-    for radius, sites_of in wanted if len(crowded) else ():
-        indices = [sites_of(m) for m in species]
-        owner = np.repeat(crowded, np.array([len(sites) for sites in indices])[kinds])
-        site = (np.cumsum(counts) - counts)[owner] + gather_per_molecule(indices, kinds)
-        offsets = [m.positions_body[sites] for m, sites in zip(species, indices, strict=True)]
-        position = system.positions_of(state, owner, gather_per_molecule(offsets, kinds))
-        i, j, distance = pairs_within(position, cell, radius)
+    for radius, sites_of in wanted:
+        chosen = system.of_sites(lambda m, sites_of=sites_of: np.isin(every_site(m), sites_of(m))).nonzero()[0]
+        i, j, distance = pairs_within(position[chosen], cell, radius)
+        i, j = chosen[i], chosen[j]
         kept = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
-        for *pair, length in zip(site[i[kept]].tolist(), site[j[kept]].tolist(), distance[kept].tolist(), strict=True):
+        for *pair, length in zip(i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True):
             near[min(pair), max(pair)] = min(length, near.get((min(pair), max(pair)), inf))
     return [(*pair, near[pair]) for pair in sorted(near)]

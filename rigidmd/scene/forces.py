@@ -26,13 +26,9 @@ class Method(NamedTuple):
 
 
 _EWALD = (
-    "ewald_accuracy",
-    "ewald_cutoff_A",
-    "ewald_alpha_per_A",
-    "ewald_surface_permittivity",
-    "ewald_slab",
+    "ewald_accuracy", "ewald_cutoff_A", "ewald_alpha_per_A", "ewald_surface_permittivity", "ewald_slab",
     "ewald_truncation",
-)
+)  # fmt: skip
 _K_VECTORS = ("ewald_k_max", "ewald_k2_max", "ewald_k_radius_per_A")
 #: Value of `electrostatics` -> the method.
 ELECTROSTATICS = {

@@ -1,10 +1,10 @@
 """Molecular models: rigid bodies in their principal frames from lists of sites. `models/` has published ones."""
 
 # isort: skip_file
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -28,8 +28,8 @@ COINCIDENT = 1e-6
 #: A site further than this fraction of the size from a linear body's axis exerts a torque without any inertia.
 OFF_AXIS = 1e-4
 MOST_PARAMETERS = 100  # of a site
-#: Keys of the well depth, of which a Lennard-Jones site has one; it also has sigma_A.
-DEPTHS = ("epsilon_kJ_mol", "epsilon_kcal_mol", "epsilon_K")
+#: Keys of the well depth, of which a Lennard-Jones site has one, and their units; it also has sigma_A.
+DEPTHS = {"epsilon_kJ_mol": KJ_PER_MOL, "epsilon_kcal_mol": ENERGY_UNITS["kcal/mol"], "epsilon_K": BOLTZMANN}
 LENNARD_JONES = ("sigma_A", *DEPTHS)
 
 #: Names of sites and residues that every structure format can hold: one to five visible ASCII characters.
@@ -70,8 +70,7 @@ class Site(Section):
     @property
     def epsilon(self) -> float:
         """Well depth in u Å²/ps²; 0 without one."""
-        kilojoules, kilocalories = (self.epsilon_kJ_mol or 0.0), (self.epsilon_kcal_mol or 0.0)
-        return kilojoules * KJ_PER_MOL + kilocalories * ENERGY_UNITS["kcal/mol"] + (self.epsilon_K or 0.0) * BOLTZMANN
+        return sum(unit * (getattr(self, key) or 0.0) for key, unit in DEPTHS.items())
 
 
 Mixing = Literal["lorentz-berthelot", "geometric"]
@@ -115,8 +114,6 @@ class Molecule:
     """
 
     name: str
-    title: str
-    source: str
     residue_names: tuple[str, ...]
     site_names: tuple[str, ...]
     elements: tuple[str, ...]
@@ -128,6 +125,8 @@ class Molecule:
     mass: float
     inertia: np.ndarray
     kind: BodyKind
+    title: str = ""
+    source: str = ""
     group: str = "other"
     note: str = ""
     mixing: Mixing | None = None
@@ -210,10 +209,9 @@ class Molecule:
         return entries
 
 
-def molecule(
-    name: str, sites: tuple[Site, ...], title: str = "", source: str = "", residue_names: tuple[str, ...] = ()
-) -> Molecule:
-    """The rigid body of these sites, each of which needs a position and a mass. Raises MoleculeError."""
+def molecule(name: str, sites: tuple[Site, ...], residue_names: tuple[str, ...] = (), **about: Any) -> Molecule:
+    """The rigid body of these sites, each of which needs a position and a mass; about: more fields of `Molecule`.
+    Raises MoleculeError."""
     missing = [(s, key) for s in sites for key in ("mass_u", "position_A") if getattr(s, key) is None]
     faults = [f"site {s.name}: {key} is missing" for s, key in missing]
     if len(sites) > MOST_SITES:
@@ -241,11 +239,12 @@ def molecule(
     if frame.kind == "point":
         body = np.zeros_like(body)  # exactly at the centre of mass, without rounding errors
     return Molecule(
-        name=name, title=title, source=source, residue_names=tuple(residue_names) or (name.upper()[:5],),
+        name=name, residue_names=tuple(residue_names) or (name.upper()[:5],),
         site_names=tuple(s.name for s in sites), elements=tuple(s.element for s in sites), masses=masses,
         positions_body=body, charges=np.array([s.charge_e or 0.0 for s in sites]),
         sigma=np.array([s.sigma_A or 0.0 for s in sites]), epsilon=np.array([s.epsilon for s in sites]),
         mass=float(frame.mass), inertia=frame.inertia, kind=frame.kind, parameters=tuple(s.parameters for s in sites),
+        **about,
     )  # fmt: skip
 
 
@@ -264,8 +263,8 @@ def with_masses(found: Molecule, masses: dict[str, float]) -> Molecule:
     if faults:
         raise MoleculeError(f"molecule {found.name}", faults)
     sites = [Site(**entry | {"mass_u": changed.get(i, entry["mass_u"])}) for i, entry in enumerate(found.sites())]
-    made = molecule(found.name, tuple(sites), found.title, found.source, found.residue_names)
-    return replace(made, group=found.group, note=found.note, mixing=found.mixing)
+    kept = ("name", "residue_names", "title", "source", "group", "note", "mixing")
+    return molecule(sites=tuple(sites), **{key: getattr(found, key) for key in kept})
 
 
 def with_parameters(sites: tuple[Site, ...], table: tuple[Site, ...]) -> tuple[Site, ...]:
@@ -311,9 +310,12 @@ def load_model(name: str) -> Molecule:
 
 def read_molecule(path: Path) -> Molecule:
     """A molecule from a TOML file like those in `models/`. Raises MoleculeError."""
-    data = _read(path, MoleculeFile)
-    found = molecule(data.name, data.sites, data.title, data.source, data.residue_names)
-    return replace(found, group=data.group, note=data.note, mixing=data.mixing)
+    return molecule_of(_read(path, MoleculeFile))
+
+
+def molecule_of(file: MoleculeFile) -> Molecule:
+    """The molecule of a file. Raises MoleculeError."""
+    return molecule(**{key: value for key, value in file if value is not None})
 
 
 def read_parameters(path: Path) -> ParameterFile:

@@ -1,14 +1,15 @@
 """Tables of a scene of molecules: [[molecules]], the species and their numbers; [structure], [box] and [start]."""
 
 import re
-from math import cos, pi, radians, sqrt
+from math import pi, radians
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
+from pydantic import AfterValidator, Field, Strict, field_validator
 
 from rigidmd.io.formats import extensions
+from rigidmd.io.formats.cells import cell_of
 from rigidmd.scene.models import Site, SiteName, available_models, model_error
 from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section, exact_names
 
@@ -73,24 +74,24 @@ class Molecules(Section):
             raise ValueError(fault)
         return model
 
-    @model_validator(mode="after")
-    def _one_source(self):
-        if self.model is not None and (self.file is not None or self.sites is not None):
-            raise ValueError("give a model, or a custom file and sites, not both")
-        whole = self.model is not None or (self.file is not None and self.file.endswith(".toml"))
-        if self.parameters is not None and whole:
-            raise ValueError("parameters would do nothing: a model or a .toml file contains parameters")
-        if self.parameters is not None and not self.parameters.endswith(".toml"):
-            raise ValueError(f"parameters = {self.parameters!r} must be a .toml file with [[sites]]")
-        if self.model is None and self.file is None and self.sites is None:
-            raise ValueError("needs one of model, file, sites")
-        if self.file is not None and self.file.endswith(".toml") and self.sites is not None:
-            raise ValueError("a .toml file has its own sites: leave out one of them")
-        if self.file is not None and not whole and self.sites is None and self.parameters is None:
-            raise ValueError("a geometry file needs sites, or a file of parameters, for its atoms")
-        if self.sites is not None and self.file is None and self.name is None:
-            raise ValueError("a custom molecule needs a name")
-        return self
+    def _errors(self):
+        """The first error, which may explain the others."""
+        model, file, sites, table = (key is not None for key in (self.model, self.file, self.sites, self.parameters))
+        whole = file and str(self.file).endswith(".toml")
+        faults = {
+            "give a model, or a custom file and sites, not both": model and (file or sites),
+            "parameters would do nothing: a model or a .toml file contains parameters": table and (model or whole),
+            f"parameters = {self.parameters!r} must be a .toml file with [[sites]]": (
+                table and not str(self.parameters).endswith(".toml")
+            ),
+            "needs one of model, file, sites": not (model or file or sites),
+            "a .toml file has its own sites: leave out one of them": whole and sites,
+            "a geometry file needs sites, or a file of parameters, for its atoms": (
+                file and not (whole or sites or table)
+            ),
+            "a custom molecule needs a name": sites and not file and self.name is None,
+        }
+        return [fault for fault, is_there in faults.items() if is_there][:1]
 
     @property
     def label(self) -> str:
@@ -166,11 +167,8 @@ class Box(Section):
         """Rows (3, 3) a along x, b in the xy plane and c, Å; None if the scene does not set it."""
         if self.lengths_A is None:
             return None
-        a, b, c = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
-        alpha, beta, gamma = (0.0 if angle == 90 else cos(radians(angle)) for angle in self.angles_deg or (90,) * 3)
-        across = sqrt(1 - gamma**2)
-        y = (alpha - beta * gamma) / across
-        return np.array([[a, 0, 0], [b * gamma, b * across, 0], [c * beta, c * y, c * sqrt(1 - beta**2 - y**2)]])
+        lengths = self.lengths_A if isinstance(self.lengths_A, tuple) else (self.lengths_A,) * 3
+        return np.diag(lengths) if self.angles_deg is None else cell_of([*lengths, *self.angles_deg])
 
 
 class Start(Section):

@@ -3,7 +3,6 @@
 A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a `scene.models.Molecule`.
 """
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -77,16 +76,16 @@ SLACK = 1.25
 
 def bonds(m: Any) -> list[tuple[int, int]]:
     """Bonds, heavier site first: atoms within bonding distance, shortest links, massless sites to nearest atoms."""
-    atoms: list[int] = np.flatnonzero(m.masses > 0).tolist()
-    part = {i: i for i in atoms}
-    found = []
-    for i, j in sorted(combinations(atoms, 2), key=lambda pair: round(distance(m, *pair), 9)):
-        reach = SLACK * sum(COVALENT.get(m.elements[s], 0.0) for s in (i, j))
-        if distance(m, i, j) <= reach or part[i] != part[j]:
-            found.append((i, j) if m.masses[i] >= m.masses[j] else (j, i))
-            part = {s: part[i] if p == part[j] else p for s, p in part.items()}
-    massless: list[int] = np.flatnonzero(m.masses == 0).tolist()
-    return sorted(found) + [(min(atoms, key=lambda i, s=s: round(distance(m, i, s), 9)), s) for s in massless]
+    from scipy.spatial.distance import cdist
+
+    x, atoms, massless = m.positions_body, np.flatnonzero(m.masses > 0), np.flatnonzero(m.masses == 0)
+    radius = SLACK * np.array([COVALENT.get(m.elements[i], 0.0) for i in atoms])
+    bonded = cdist(x[atoms], x[atoms]) <= radius[:, None] + radius
+    bonded[tuple(shortest_links(x[atoms]).T)] = True
+    pairs = atoms[np.argwhere(np.triu(bonded | bonded.T, 1))].tolist()
+    found = sorted((i, j) if m.masses[i] >= m.masses[j] else (j, i) for i, j in pairs)
+    nearest = atoms[cdist(x[massless], x[atoms]).round(9).argmin(axis=1)]
+    return [*found, *zip(nearest.tolist(), massless.tolist(), strict=True)]
 
 
 def distance(m: Any, i: int, j: int) -> float:
