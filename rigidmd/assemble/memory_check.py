@@ -4,19 +4,16 @@ NumPy's arrays of zeros take no memory before they are written, so the arrays of
 """
 
 from math import prod
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidmd.core.process import format_gigabytes, free_memory, memory_shortage
 from rigidmd.core.state import no_load
+from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import not_none
 from rigidmd.units import FEMTOSECOND
-
-if TYPE_CHECKING:
-    from rigidmd.engines.system import System
 
 #: Bytes per molecule and site of a system while it is built; measured per site: 310 of argon, 500 of nitrogen, 640 of
 #: SPC/E, 690 of TIP4P.
@@ -50,7 +47,7 @@ def check_memory_of_samples(scene: BodyScene) -> None:
     _require(scene.source, BYTES_PER_SAMPLE * count, f"a run with {count:.3g} samples", "lengthen output.interval_s")
 
 
-def check_memory(system: "System") -> None:
+def check_memory(system: System) -> None:
     """Raise SceneError if a run of a system exceeds the memory: states, forces, lists, grids, samples."""
     source = system.scene.source
     try:
@@ -77,7 +74,7 @@ def _samples(scene: MolecularScene) -> tuple[float, float]:
     return lines, BYTES_PER_LOG_LINE * lines + BYTES_PER_FRAME * (frames if output.trajectory else 0)
 
 
-def bytes_of(system: "System") -> int:
+def bytes_of(system: System) -> int:
     """Bytes of a run: three states (start, present, last good one), two loads (of steps and observations), samples."""
     state = system.state
     trajectory = BYTES_PER_TRAJECTORY_SITE * system.site_count if system.scene.output.trajectory else 0

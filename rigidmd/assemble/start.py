@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from rigidmd.assemble.structure import Configuration, read_structure, with_reduc
 from rigidmd.core.state import State
 from rigidmd.dynamics.model import Model, draw_momenta, mobile, remove_momentum
 from rigidmd.dynamics.noise import LATTICE, MOMENTA
+from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
@@ -23,9 +23,6 @@ from rigidmd.scene.fields import AXES
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import not_none
 from rigidmd.units import GRAM_PER_CM3
-
-if TYPE_CHECKING:
-    from rigidmd.engines.system import System
 
 
 def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Configuration:
@@ -143,7 +140,7 @@ OVERLAP = 0.6
 INSIDE = 0.2
 
 
-def overlaps(system: "System") -> list[str]:
+def overlaps(system: System) -> list[str]:
     """Messages on overlapping molecules, at most five of them."""
     inside = INSIDE * min([m.radius for m in system.species if m.radius > 0], default=0.0)
     cores = [np.where(m.epsilon > 0, m.sigma, 0.0) for m in system.species]
@@ -164,7 +161,7 @@ def every_site(molecule: Molecule) -> np.ndarray:
 
 
 def close_pairs(
-    system: "System", state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
+    system: System, state: State, *wanted: tuple[float, Callable[[Molecule], np.ndarray]]
 ) -> list[tuple[int, int, float]]:
     """Sites (i, j) of different molecules, not both frozen, within a radius, and their distances, Å. `wanted` are
     radii, and functions for the indices of the sites of a molecule to which they apply."""

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,18 +18,16 @@ from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
 from rigidmd.engines.cpu.engine import CompileError
+from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.parts import Tail, sum_of_tails
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.forces import CustomForce
 from rigidmd.scene.molecules import name_of
 
-if TYPE_CHECKING:
-    from rigidmd.engines.system import System
-    from rigidmd.scene import MolecularScene
-    from rigidmd.scene.forces import CustomForce
 
-
-def custom_forces(scene: "MolecularScene") -> list[Any]:
+def custom_forces(scene: MolecularScene) -> list[Any]:
     """The objects of [[forces.custom]]. Raises SceneError with all errors."""
     found, faults = [], []
     for k, entry in enumerate(scene.forces.custom):
@@ -44,7 +42,7 @@ def custom_forces(scene: "MolecularScene") -> list[Any]:
     return found
 
 
-def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
+def _custom(scene: MolecularScene, entry: CustomForce, key: str) -> Any:
     if entry.module is None:
         pairs = {pair.sites: pair.parameters for pair in entry.pairs}
         table = None if entry.table is None else scene.path(entry.table)
@@ -68,7 +66,7 @@ def _custom(scene: "MolecularScene", entry: "CustomForce", key: str) -> Any:
 
 
 @contextmanager
-def user_errors_explained(system: "System") -> Iterator[None]:
+def user_errors_explained(system: System) -> Iterator[None]:
     """Convert errors of user code before the first step, including Numba's, to a SceneError."""
     try:
         yield
@@ -90,7 +88,7 @@ def user_errors_explained(system: "System") -> Iterator[None]:
         raise SceneError(system.scene.source, [f"{names}: cannot be compiled{where}: {why}"]) from None
 
 
-def with_user_code(system: "System") -> "System":
+def with_user_code(system: System) -> System:
     """The system with [[forces.custom]] and terms and thermostat from Python. Raises SceneError with all errors."""
     scene, (added, thermostat) = system.scene, system.scene.user_code
     forces = [*custom_forces(scene), *added]
@@ -123,7 +121,7 @@ def with_user_code(system: "System") -> "System":
     )  # fmt: skip
 
 
-def _term(made: Any, name: str, system: "System", found: "System", tails: list[Tail]) -> NamedTuple:
+def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]) -> NamedTuple:
     """The term of one object for a system. Its function, description and notes are added to `found`, its tail
     correction to `tails`. Raises PairPotentialError, ValueError, UserForceError."""
     if isinstance(made, PairLaw):

@@ -2,17 +2,15 @@
 
 import time as clock
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from rigidmd.core.state import State
+from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError, describe_error
 from rigidmd.forces.fields.python_forces import PythonForces, PythonForcesWorkspace
 from rigidmd.units import KJ_PER_MOL
-
-if TYPE_CHECKING:
-    from rigidmd.engines.system import System
 
 EVERY = (True, True, True)
 
@@ -20,7 +18,7 @@ EVERY = (True, True, True)
 class HasTerm(Protocol):
     """An object that makes a compiled term for a system."""
 
-    def term(self, system: "System") -> Any:
+    def term(self, system: System) -> Any:
         """A NamedTuple of a class with `compiled_force`."""
         ...
 
@@ -28,7 +26,7 @@ class HasTerm(Protocol):
 class HasStage(Protocol):
     """An object that makes a compiled thermostat for each stage."""
 
-    def for_stage(self, system: "System", k: int) -> Any:
+    def for_stage(self, system: System, k: int) -> Any:
         """The thermostat of stage k, a NamedTuple of a class with `compiled_thermostat`."""
         ...
 
@@ -58,7 +56,7 @@ class Force:
     tied_to_places: ClassVar[bool] = True
     energy_noise: ClassVar[float] = 0.0
 
-    def begin(self, system: "System") -> None:
+    def begin(self, system: System) -> None:
         """Called once with the system, which has `sites` (names, elements, masses, charges), `species` and `model`."""
 
     def on_sites(self, position: np.ndarray, state: State) -> tuple:
@@ -82,7 +80,7 @@ class BoundForce:
     calls, seconds : how often it was called, and the time that this took
     """
 
-    def __init__(self, force: Force, name: str, system: "System"):
+    def __init__(self, force: Force, name: str, system: System):
         self.force, self.name, self.system = force, name, system
         self._by_site = type(force).on_sites is not Force.on_sites
         if self._by_site == (type(force).on_molecules is not Force.on_molecules):

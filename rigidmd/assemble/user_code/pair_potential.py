@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from rigidmd.core.files import unreadable_reason
+from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
 from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, sites_named
@@ -24,9 +25,6 @@ from rigidmd.forces.potentials.truncation import (
 )  # fmt: skip
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
-
-if TYPE_CHECKING:
-    from rigidmd.engines.system import System
 
 Rule = Literal["geometric", "arithmetic", "harmonic"]
 RULES: tuple[str, ...] = get_args(Rule)
@@ -86,7 +84,7 @@ class PairLaw:
             raise PairPotentialError(str(error)) from None
         return not_none(self.formula_of_function)
 
-    def bind(self, system: "System") -> tuple[PairForces, Formula, Tail | None, list[str]]:
+    def bind(self, system: System) -> tuple[PairForces, Formula, Tail | None, list[str]]:
         """The potential between the sites of a system: its term, formula, tail correction if the scene has it, notes.
         Raises PairPotentialError with all errors."""
         forces = system.scene.forces
@@ -167,7 +165,7 @@ def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | 
     return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
 
 
-def check_cutoff(cutoff: float, system: "System") -> None:
+def check_cutoff(cutoff: float, system: System) -> None:
     """Raise PairPotentialError unless the box is large enough for a cutoff (Å)."""
     half = min(system.space.edges) / 2
     if cutoff == inf and system.space.volume < inf:
