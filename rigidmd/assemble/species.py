@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.core.files import unreadable_reason
 from rigidmd.errors import InputError, MoleculeError, SceneError, StructureError
 from rigidmd.forces.parts import select_by_number
 from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms
@@ -117,8 +116,6 @@ def model_from_geometry(
     name : default: the name of the file. Raises StructureError or MoleculeError, with all errors.
     """
     notes, source = [], [f"geometry of {geometry.name}"]
-    if fault := unreadable_reason(geometry):
-        raise StructureError(str(geometry), [fault])
     names, elements, *_ = read_geometry(geometry)
     if parameters is None:
         sites = sites_of_geometry(geometry, (), tuple(Site(name=element) for element in dict.fromkeys(elements)), "")

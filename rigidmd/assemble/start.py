@@ -42,14 +42,18 @@ def starting_configuration(scene: MolecularScene, species: list[Molecule]) -> Co
 
 
 def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configuration:
+    cell, counts = scene.box.cell, [entry.count or 0 for entry in scene.molecules]
+    if cell is None and scene.structure is None:
+        mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
+        cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
+    if cell is not None and (fault := cell_error(cell)):
+        raise SceneError(scene.source, [f"box: {fault}"])
     if scene.structure is not None:
         start, content = scene.structure, scene.embedded_files.get("structure.file")
         path = scene.path(start.file) if content is None else Path(start.file)
-        if scene.box.cell is not None and (fault := cell_error(scene.box.cell)):
-            raise SceneError(scene.source, [f"box: {fault}"])
         try:
             found = read_structure(
-                path, species, scene.box.cell, scene.box.periodic, start.tolerance, start.frame, start.repeat,
+                path, species, cell, scene.box.periodic, start.tolerance, start.frame, start.repeat,
                 start.atom_types, None if scene.topology is None else scene.path(scene.topology), content,
             )  # fmt: skip
         except StructureError as error:
@@ -64,15 +68,9 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
         if faults:
             raise StructureError(scene.structure_source, faults)
         return found
-    counts = [not_none(entry.count) for entry in scene.molecules]
     n, sites = sum(counts), sum(count * len(m.masses) for count, m in zip(counts, species, strict=True))
     check_memory_of_molecules(scene.source, n, sites)
-    if (cell := scene.box.cell) is None:
-        mass = sum(count * m.mass for count, m in zip(counts, species, strict=True))
-        cell = np.eye(3) * np.cbrt(mass / (not_none(scene.box.density_g_cm3) * GRAM_PER_CM3))
-    if fault := cell_error(cell):
-        raise SceneError(scene.source, [f"box: {fault}"])
-    rng = np.random.default_rng([scene.seed, LATTICE])
+    cell, rng = not_none(cell), np.random.default_rng([scene.seed, LATTICE])
     found = Configuration(
         species=np.repeat(np.arange(len(species)), counts),
         position=_start_lattice(scene, species, n, np.diag(cell), rng), rotation=random_rotations(rng, n),

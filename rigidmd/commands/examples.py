@@ -5,14 +5,14 @@ from rigidmd.commands.arguments import Options, command
 
 @command(10, "list the scenes, notebooks and scripts that rigidmd ships", "rigidmd examples")
 def _examples(options: Options) -> int:
-    from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples, examples_in
+    from rigidmd.core.shipped import NOTEBOOKS, SCRIPTS, examples
 
     scenes = examples()
     kinds = {
         "molecules": [example for example in scenes if not example.is_body],
         "one body": [example for example in scenes if example.is_body],
-        "notebooks": examples_in(NOTEBOOKS),
-        "scripts, which extend it": examples_in(SCRIPTS),
+        "notebooks": examples(NOTEBOOKS),
+        "scripts, which extend it": examples(SCRIPTS),
     }
     width = max(len(example.name) for example in scenes)
     for title, found in kinds.items():

@@ -52,26 +52,20 @@ class Example(NamedTuple):
         return KINDS[self.path.suffix]
 
 
-def examples() -> list[Example]:
-    """The shipped scenes, sorted by name; numbers within names are sorted by value."""
-    found = examples_in("*.toml")
-    return sorted(found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)])
-
-
-def examples_in(files: str) -> list[Example]:
-    """The shipped examples among these files, such as notebooks/*.ipynb or scripts/*.py, sorted by name."""
+def examples(files: str = "*.toml") -> list[Example]:
+    """The shipped scenes, or the examples among other files, sorted by name; numbers within names by their value."""
     found = []
-    for path in sorted(SYSTEMS.glob(files)):
+    for path in SYSTEMS.glob(files):
         text = path.read_text(encoding="utf-8")
         is_body = path.suffix == ".toml" and "body" in tomllib.loads(text)
         first = "".join(json.loads(text)["cells"][0]["source"]) if path.suffix == ".ipynb" else text
         found.append(Example(path.stem, path, first.partition("\n")[0].removeprefix("# "), is_body))
-    return found
+    return sorted(found, key=lambda one: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", one.name)])
 
 
 def find_example(name: str) -> Example:
     """The example of this name, or the first scene of a numbered series of this name. Raises InputError."""
-    known = {example.name: example for example in [*examples(), *examples_in(NOTEBOOKS), *examples_in(SCRIPTS)]}
+    known = {example.name: example for example in [*examples(), *examples(NOTEBOOKS), *examples(SCRIPTS)]}
     if name in known:
         return known[name]
     if series := series_of(name):

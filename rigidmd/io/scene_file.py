@@ -9,9 +9,11 @@ from typing import Any
 import tomli_w
 
 from rigidmd.core.files import atomic_file, write_text
+from rigidmd.core.toml import plain_values
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import STRUCTURE
 from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene.base import override
 from rigidmd.scene.models import MoleculeFile
 
 
@@ -24,7 +26,7 @@ def input_names(scene: Scene) -> dict[str, str]:
 
 def write_scene(folder: Path, scene: Scene) -> None:
     """Write the scene into the folder of a run, so that it can be run again. Keys that do nothing are left out."""
-    data: Any = scene.model_dump(exclude_none=True)
+    data = plain_values(scene.model_dump(exclude_none=True))
     if isinstance(scene, MolecularScene):
         for section, table in [(scene.forces, data["forces"]), *zip(scene.stages, data["stages"], strict=True)]:
             for key in section.idle_keys:
@@ -35,11 +37,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 temporary.write_bytes(scene.embedded_files[key])
             else:
                 shutil.copyfile(scene.inputs[key], temporary)
-        *tables, last = key.split(".")
-        section: Any = data
-        for part in tables:
-            section = section[int(part) if isinstance(section, list | tuple) else part]
-        section[last] = copied
+        override(data, key, copied)
     write_text(folder / SCENE, tomli_w.dumps(data))
 
 

@@ -152,8 +152,6 @@ def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None
         if name.name != path.name or wide or content.startswith(codecs.BOM_UTF8):
             source = Path(folder) / name.name
             source.write_bytes(text.encode() if wide else content.removeprefix(codecs.BOM_UTF8))
-        if form is not None and form.read_packed is not None:
-            return form.read_packed(path, source)
         return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, source)]
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from rigidmd.scene.molecules import MolecularScene
 
 LONGEST_NAME = 100
+#: Keys that name a file.
+FILE_KEYS = re.compile(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)")
 PathName = str | os.PathLike
 AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
@@ -163,7 +165,8 @@ class Scene(Section, Displayed):
             raise SceneError(source, ["has neither [body], for a single body, nor [[molecules]]"])
         faults, overridden = [], []
         for named, value in overrides.items():
-            key, wrong = _override(data, named, value)
+            is_file = isinstance(value, str) and FILE_KEYS.fullmatch(named)
+            key, wrong = override(data, named, os.path.abspath(value) if is_file else value)
             faults += wrong
             if value is None and parse_whole_number(key.rpartition(".")[2]) is not None:
                 text = ""  # the entries after a removed one are numbered differently in the text
@@ -277,11 +280,9 @@ def _has_key(data: Any, key: str) -> bool:
     return not isinstance(data, dict)
 
 
-def _override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
+def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, with numbers for names
     of entries of lists, and error messages."""
-    if re.fullmatch(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)", key):
-        value = os.path.abspath(value) if isinstance(value, str) else value
     *parents, last = key.split(".", DEEPEST + 1)
     if len(parents) > DEEPEST:
         return key, [f"--set {shorten_repr(key)}: is a key of more than {DEEPEST} parts"]

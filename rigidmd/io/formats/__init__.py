@@ -34,7 +34,6 @@ class Format(NamedTuple):
     read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
     content: re.Pattern[str] | None = None  # recognises the begin of a text whose extension is unknown
     has_types: bool = False
-    read_packed: Callable[[Path, Path], list[Callable[[], Atoms]]] | None = None  # (path for messages, unpacked file)
     # A frame of a trajectory, 1 for the first, -1 for the last. If the format has no names, `read_arrays` returns the
     # position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a damaged file may crash it.
     read_frame: Callable[[Path, int], Atoms] | None = None

@@ -8,8 +8,7 @@ It is read item by item, and sizes are checked before arrays are allocated.
 import contextlib
 import io
 import os
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -44,7 +43,7 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         with ignore_warnings():
             found = cast("list[AseAtoms]", ase.io.read(source, index=":", **options))
     except ase.io.formats.UnknownFileTypeError:
-        known = " ".join(extensions(lambda form: form.read or form.read_packed))
+        known = " ".join(extensions(lambda form: form.read or form.reader))
         raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
         reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
@@ -54,10 +53,10 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
     return [atoms for atoms in found if len(atoms)]
 
 
-def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=None, notes=()) -> Atoms:
-    """Atoms in Å, ps and u from ASE's. By default, names and elements are ASE's symbols."""
-    symbols = atoms.get_chemical_symbols()
-    notes = list(notes)
+def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atoms:
+    """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By default, names and
+    elements are ASE's symbols."""
+    symbols, notes = atoms.get_chemical_symbols(), []
     if names is not None and len(names) != len(atoms):
         raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
     occupied = {(e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()}
@@ -79,6 +78,7 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None, masses=
     elif atoms.pbc.any():
         axes = ", ".join(x for x, periodic in zip("abc", atoms.pbc, strict=True) if periodic)
         notes.append(f"its cell is periodic along {axes} only and is not used")
+    masses = atoms.get_masses() if atoms.has("masses") else None
     return Atoms(
         symbols if names is None else names, symbols if elements is None else elements,
         [()] * len(atoms) if residue is None else residue, atoms.get_positions(), velocity, cell, masses, notes,
@@ -276,14 +276,7 @@ class TrajFile(FrameFile):
         return TrajectoryWriter(path, mode)
 
 
-def read_packed(path: Path, source: Path) -> list[Callable[[], Atoms]]:
-    """The frames of any .traj of ASE, with masses that are not its standard ones."""
-    found = read_by_ase(path, source)
-    masses = [atoms.get_masses() if atoms.has("masses") else None for atoms in found]
-    return [partial(from_ase, path, atoms, masses=of_atoms) for atoms, of_atoms in zip(found, masses, strict=True)]
-
-
 register(Format(
-    (".traj",), read_packed=read_packed, writer=TrajFile, reader=TrajReader, velocities=True, double=True,
+    (".traj",), writer=TrajFile, reader=TrajReader, velocities=True, double=True,
     viewer="ase gui {trajectory}",
 ))  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN, Atoms, Frame, atom_count, is_element, numbers, structure_error, without_fortran,
+    HEAVY_HYDROGEN, Atoms, Frame, atom_count, is_element, numbers, unexpected, without_fortran,
 )  # fmt: skip
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import FrameFiles
@@ -31,11 +31,11 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
         what = f"{width} columns, {properties[1]}" if properties else "an atom of an .xyz: name, x, y, z"
         lattice = re.search(r"\blattice=\"([^\"]*)\"", clean[-1], re.IGNORECASE)
         if lattice and len(numbers(path, at + 2, lattice[1].split(), "numbers of Lattice")) not in (3, 9):
-            raise structure_error(path, f"line {at + 2}: expected nine numbers of Lattice, found {lattice[1]!r}")
+            raise unexpected(path, at + 2, "nine numbers of Lattice", lattice[1])
         for k in range(at + 2, at + 2 + count):
             words = lines[k].split()
             if len(words) < width:
-                raise structure_error(path, f"line {k + 1}: expected {what}, found {lines[k].strip()[:60]!r}")
+                raise unexpected(path, k + 1, what, lines[k].strip())
             if place is not None:
                 numbers(path, k + 1, words[place : place + 3], what)
             words = [word if i == column else without_fortran(word) for i, word in enumerate(words)]
@@ -54,8 +54,7 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
         names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
         if NAMES in atoms.arrays:
             names = [str(name) for name in atoms.arrays[NAMES]]
-        masses = atoms.get_masses() if atoms.has("masses") else None
-        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms), masses))
+        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms)))
     return frames
 
 
