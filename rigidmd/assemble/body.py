@@ -123,11 +123,8 @@ def _body_errors(
     if scene.output.drawn_as == "top" and rotates:
         at_centre, _ = principal(inertia_at_centre(scene))
         if axis_of_symmetry(at_centre) is None:
-            shown = ", ".join(f"{moment:.4g}" for moment in at_centre)
-            yield (
-                "output.drawn_as: a top has two equal moments of inertia about its centre of mass, and these are "
-                f"{shown} kg m²; name 'cuboid', 'ellipsoid' or a solid"
-            )
+            these = f"these are {', '.join(f'{x:.4g}' for x in at_centre)} kg m²; name 'cuboid', 'ellipsoid' or a solid"
+            yield f"output.drawn_as: a top has two equal moments of inertia about its centre of mass, and {these}"
     if scene.body.pinned:
         if scene.changing_inertia is not None and centre.any():
             yield "changing_inertia: the centre of mass must be at the pivot of a pinned body"
@@ -192,10 +189,8 @@ def _integrator_errors(scene: BodyScene, immersed: bool, has_functions: bool) ->
         return [f"run: {run.integrator} has negative substeps, which a resistance does not allow: use one of {forward}"]
     if scheme.has_gradient and (resisted or scene.applied or has_functions):
         plain = [name for name, other in SCHEMES.items() if other.order > 2 and not other.has_gradient]
-        return [
-            f"run: {run.integrator} needs the gradient of the forces, which resistance and applied forces do not have; "
-            f"use one of {', '.join(plain)}"
-        ]
+        what = "the gradient of the forces, which resistance and applied forces do not have"
+        return [f"run: {run.integrator} needs {what}; use one of {', '.join(plain)}"]
     frame = frame_of(scene)
     axis_changes = isinstance(frame, RotatingFrame) and not has_constant_direction(frame.angular_velocity)
     why = {"wheels": scene.wheels, "changing_inertia": scene.changing_inertia, "added mass": immersed}

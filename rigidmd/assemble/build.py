@@ -97,31 +97,28 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         why = f"hybrid_monte_carlo needs an energy that does not depend on time, and {', '.join(driven)} do"
         raise SceneError(scene.source, [f"{fault}: {why}: choose another thermostat" for fault in faults])
     check_memory(system)
-    system.notes.extend(scene.rounded_times())
+    system.notes.extend([*scene.rounded_times(), *set_momenta(scene, model, state, start)])
+    stuck = "nothing moves and no temperature is defined; use thermostat = 'langevin'"
     system.notes.extend(
-        f"stages.{k}: the total momentum is conserved and zero, so that nothing moves and no temperature is defined; "
-        "use thermostat = 'langevin'"
+        f"stages.{k}: the total momentum is conserved and zero, so that {stuck}"
         for k, stage in enumerate(scene.stages)
         if not stage.is_minimisation and len(index) and system.freedom_in(k).total == 0 and mobile(model).any()
     )
-    system.notes.extend(set_momenta(scene, model, state, start))
     system.notes.extend(
         f"{m.name} was developed with {m.mixing} mixing, forces.mixing is {scene.forces.mixing}"
         for m in {m.name: m for m in species}.values()
         if m.mixing not in (None, scene.forces.mixing)
     )
-    if scene.structure is not None:
-        system.notes.append(
-            f"{len(index)} molecules read from {scene.structure.file}; distances of atoms from rigid templates: "
-            f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
-        )
-        system.notes.extend(f"{scene.structure.file}: {note}" for note in start.notes)
-        if faults := overlaps(system):
-            if not scene.stages[0].is_minimisation:
-                raise StructureError(scene.structure_source, faults)
-            system.notes.append(f"{scene.structure.file}: {'; '.join(faults)}: the minimisation separates them")
-    else:
+    if scene.structure is None:
         system.notes.extend(f"box: {note}" for note in start.notes)
+        return system
+    file, off = scene.structure.file, f"rms {start.residual_rms:.4f} Å, largest {start.residual_max:.4f} Å"
+    system.notes.append(f"{len(index)} molecules read from {file}; distances of atoms from rigid templates: {off}")
+    system.notes.extend(f"{file}: {note}" for note in start.notes)
+    if faults := overlaps(system):
+        if not scene.stages[0].is_minimisation:
+            raise StructureError(scene.structure_source, faults)
+        system.notes.append(f"{file}: {'; '.join(faults)}: the minimisation separates them")
     return system
 
 

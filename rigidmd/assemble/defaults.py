@@ -161,18 +161,14 @@ def _cutoff_and_switch(forces: Forces, composition: Composition) -> tuple[dict[s
     cutoff, start, faults = given or inf, forces.switch_start_A, []
     half = min(space.edges) / 2
     least = "the smallest of a_x, b_y, c_z" if isinstance(space, Triclinic) else "the shortest edge"
+    limit = f"half {least} of the box, {half:.3f} Å"
     for key, value in (("cutoff_A", cutoff), ("ewald_cutoff_A", forces.ewald_cutoff_A or 0.0)):
-        if not value > half:
-            continue
-        default = "" if getattr(forces, key) else " (the default)"
-        faults.append(
-            f"forces.{key} = {value:g}{default} is longer than half {least} of the box, {half:.3f} Å, "
-            "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
-        )
-    for m in composition.species:
-        if (extent := pdist(m.positions_body).max(initial=0.0)) > half:
-            longer = f"more than half {least} of the box, {half:.3f} Å"
-            faults.append(f"a molecule of {m.name} is {extent:.2f} Å long, {longer}")
+        if value > half:
+            default = "" if getattr(forces, key) else " (the default)"
+            why = "which violates the minimum-image convention. Use a larger box or a shorter cutoff"
+            faults.append(f"forces.{key} = {value:g}{default} is longer than {limit}, {why}")
+    extents = {m.name: pdist(m.positions_body).max(initial=0.0) for m in composition.species}
+    faults += [f"a molecule of {m} is {x:.2f} Å long, more than {limit}" for m, x in extents.items() if x > half]
     if start is not None and start >= cutoff:
         faults.append(f"forces.switch_start_A = {start:g} is not below the cutoff of {cutoff:g} Å")
     if forces.tail_correction and space.volume == inf:

@@ -90,10 +90,8 @@ def with_reduced_cell(found: Configuration, whose: str, may_rotate: bool) -> Con
     if np.array_equal(cell, found.cell):
         return found
     basis = basis_of(cell @ rotation, found.cell)
-    note = (
-        f"{whose} lattice is given by the cell with {describe_cell(cell)}, {describe_basis(basis)}, "
-        f"in place of {describe_cell(found.cell)}"
-    )
+    used = f"{describe_cell(cell)}, {describe_basis(basis)}"
+    note = f"{whose} lattice is given by the cell with {used}, in place of {describe_cell(found.cell)}"
     if not np.array_equal(rotation, np.eye(3)):
         note += "; rotated, contents included"
         found = found._replace(

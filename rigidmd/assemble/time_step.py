@@ -113,10 +113,9 @@ def step_warnings(scene: MolecularScene) -> list[str]:
     species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
     for k, stage, temperature in _given_steps(scene):
         if (order := stage.scheme.order) > 2 and jumps:
-            warnings.append(
-                f"stages.{k}: {stage.integrator} is of order {order}, lost where forces jump to 0 at the cutoff, "
-                f"as with forces.truncation = {scene.forces.truncation!r}. Use truncation = 'smooth_switch'"
-            )
+            lost = f"lost where forces jump to 0 at the cutoff, as with forces.truncation = {forces.truncation!r}"
+            advice = "Use truncation = 'smooth_switch'"
+            warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
         if (fastest := fastest_motion(species, temperature)) is None or not scene.watch.stable_step:
             continue
         time, size, unit, name, does = fastest
@@ -163,11 +162,9 @@ def with_precision(
         precision, stage = precision_for(errors[k]), scene.stages[k]
         step, ratio = f"{stage.integrator} at {stage.timestep_fs:g} fs", errors[k] / MIXED_ERROR
         times = f"{ratio:,.0f}" if ratio > 9 else f"{ratio:.1g}"
-        why = (
-            f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times "
-            f"that of single precision, {MIXED_ERROR:.0e}"
-            f"{'' if precision == 'mixed' else f', and not {MARGIN} times'}"
-        )
+        single = f"that of single precision, {MIXED_ERROR:.0e}"
+        why = f"the error of {step}, about {errors[k]:.0e} of the forces, is {times} times {single}"
+        why += "" if precision == "mixed" else f", and not {MARGIN} times"
         if ratio == inf:
             why = f"{step} is unstable for motions of these molecules, which hides the error of single precision"
         elif ratio == 0:

@@ -119,10 +119,8 @@ def _run(options: Options, sweep: "OpenSweep") -> int:
         with progress_of(sweep.left, "points", True) as bar:
             outcome = run_points(folder, manifest, runner, options.walltime, options.trust, _shown_on(bar))
     _print_results(sweep, options.extrapolate)
-    print(
-        f"  {len(outcome.finished)} finished, {len(outcome.failed)} failed, {before} skipped, "
-        f"{len(outcome.left)} left; {outcome.seconds:.3g} s"
-    )
+    ended = f"{len(outcome.finished)} finished, {len(outcome.failed)} failed, {before} skipped"
+    print(f"  {ended}, {len(outcome.left)} left; {outcome.seconds:.3g} s")
     for point in manifest.points:
         if point.folder in outcome.failed:
             print(f"  failed: {point.folder}: {visible(point.message or '')}")

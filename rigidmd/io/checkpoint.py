@@ -54,6 +54,8 @@ def _contents(archive: zipfile.ZipFile) -> str:
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError if any bit differs from what was written."""
+    if reason := unreadable_reason(path):
+        raise CheckpointError(f"{path}: {reason}")
     try:
         with zipfile.ZipFile(path) as archive:
             if archive.read(CONTENTS).decode() != _contents(archive):
@@ -76,15 +78,11 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
     errors = []
     for name in (CHECKPOINT, PREVIOUS):
         path = folder / name
-        if not os.path.lexists(path):
-            continue
-        if reason := unreadable_reason(path):
-            errors.append(f"{path}: {reason}")
-            continue
-        try:
-            return read_checkpoint(path), errors
-        except CheckpointError as error:
-            errors.append(str(error))
+        if os.path.lexists(path):
+            try:
+                return read_checkpoint(path), errors
+            except CheckpointError as error:
+                errors.append(str(error))
     there = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")

@@ -252,9 +252,8 @@ def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
 
 def _kind_of_scene(data: dict, body: "type[BodyScene]", molecules: "type[MolecularScene]"):
     """The class of scenes with these tables; None if no table belongs to either class."""
-    for kind, marker in ((body, "body"), (molecules, "molecules")):
-        if marker in data:
-            return kind
+    if "body" in data or "molecules" in data:
+        return body if "body" in data else molecules
     count = {kind: len(set(data) & set(kind.model_fields) - set(Scene.model_fields)) for kind in (body, molecules)}
     best = max(count, key=lambda kind: count[kind])
     return best if count[best] > 0 else None

@@ -188,11 +188,10 @@ FIELDS = {
 
 def field_notes(scene: "MolecularScene") -> list[str]:
     method = scene.forces.electrostatics
-    note = (
-        f"fields.walls: {method} includes the periodic images beyond the walls, which act on the layer between the "
-        "walls across the empty part of the box; a longer box reduces this effect"
-    )
-    return [note] if scene.fields.walls and method and ELECTROSTATICS[method].sums_images else []
+    if not (scene.fields.walls and method and ELECTROSTATICS[method].sums_images):
+        return []
+    effect = "act on the layer between the walls across the empty part of the box; a longer box reduces this effect"
+    return [f"fields.walls: {method} includes the periodic images beyond the walls, which {effect}"]
 
 
 def field_errors(scene: "MolecularScene") -> Iterator[str]:
@@ -209,10 +208,9 @@ def field_errors(scene: "MolecularScene") -> Iterator[str]:
             yield f"fields.walls: the walls across {name} leave no space between them"
         along = fields.gravity_m_s2 is not None and fields.gravity_m_s2[axis]
         if along and boxed and bounds is None and not held:
-            yield (
-                f"fields.gravity_m_s2: nothing stops the fall along {name}, which is periodic: all molecules would be "
-                f"accelerated together. Add walls across {name}, freeze or restrain some molecules, or use no box"
-            )
+            why = f"nothing stops the fall along {name}, which is periodic: all molecules would be accelerated together"
+            advice = f"Add walls across {name}, freeze or restrain some molecules, or use no box"
+            yield f"fields.gravity_m_s2: {why}. {advice}"
     if fields.walls and scene.forces.tail_correction:
         yield "forces.tail_correction assumes a uniform liquid: omit it between walls"
     period = inf if fields.electric_frequency_per_ps is None else 1000 / fields.electric_frequency_per_ps

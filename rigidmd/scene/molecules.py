@@ -44,10 +44,8 @@ def name_of(thing: Any) -> str:
 def missing_user_code(wanted: Sequence[str], given: Sequence[str]) -> str:
     """The error message of a scene without the user code that its `from_python` lists."""
     there = f"; this has {', '.join(given)}" if given else ""
-    return (
-        f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. Run it from Python "
-        "with the same: Simulation(scene, forces=[...], thermostat=...)"
-    )
+    advice = "Run it from Python with the same: Simulation(scene, forces=[...], thermostat=...)"
+    return f"from_python: this run had {', '.join(wanted)} from Python, which no file holds{there}. {advice}"
 
 
 Interval = Annotated[float, Strict(), Field(gt=0, le=1e9)]
@@ -334,7 +332,6 @@ class MolecularScene(Scene):
             if stage.is_auto:
                 yield f"output.trajectory: a {kind} file cannot follow the step of stages.{k}; {other}"
             elif abs(every * stage.timestep_fs / 1000 - wanted) > 1e-9 * wanted or uneven:
-                yield (
-                    f"output.trajectory: a {kind} file stores one time between frames, and stages.{k} cannot keep "
-                    f"{wanted:g} ps: make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
-                )
+                fault = f"a {kind} file stores one time between frames, and stages.{k} cannot keep {wanted:g} ps"
+                advice = f"make it a multiple of timestep_fs and a divisor of duration_ps, or {other}"
+                yield f"output.trajectory: {fault}: {advice}"

@@ -149,10 +149,8 @@ def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]
     if isinstance(made, PairForces):  # with a potential that is not a `PairLaw`
         check_cutoff(made.potential.cutoff, system)  # type: ignore[attr-defined]  # every pair potential has a cutoff
     if not (isinstance(made, PairForces) or type(made) in FORCES):
-        raise ValueError(
-            f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, a NamedTuple of a class with "
-            "rigidmd.compiled_force, or an object whose term(system) makes one"
-        )
+        compiled = "a NamedTuple of a class with rigidmd.compiled_force, or an object whose term(system) makes one"
+        raise ValueError(f"{made!r:.80} is not a force: give a rigidmd.Force, a rigidmd.pair_law, {compiled}")
     numbers = ", ".join(f"{key} = {x:.6g}" for key, x in made._asdict().items() if isinstance(x, int | float))
     found.user_terms[name] = f"{type(made).__qualname__}{f' with {numbers}' if numbers else ''}"
     return made

@@ -1,6 +1,7 @@
 """Forces that users write in plain Python."""
 
 import time as clock
+import traceback
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
@@ -162,11 +163,9 @@ class BoundForce:
         except UserForceError:
             raise
         except (Exception, SystemExit) as error:  # user code may raise anything
-            trace = error.__traceback__
-            while trace is not None and trace.tb_next is not None:
-                trace = trace.tb_next
-            line = f", line {trace.tb_lineno} of {trace.tb_frame.f_code.co_filename}" if trace is not None else ""
-            raise UserForceError(f"{what} of the force {self.name} raised {describe_error(error)}{line}") from error
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            where = f", line {last.lineno} of {last.filename}"
+            raise UserForceError(f"{what} of the force {self.name} raised {describe_error(error)}{where}") from error
 
 
 def _numbers(given: Any) -> np.ndarray | None:

@@ -265,10 +265,8 @@ class _SiteTypes:
             elif rule == "harmonic" and a + b != 0:
                 found[name] = 2 * a * b / (a + b)
             else:
-                faults.append(
-                    f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no {rule} mean: "
-                    f"give {name} of that pair in pairs, or another rule in mixing"
-                )
+                what = f"{name} of {self.example(i)} and {self.example(j)}, {a:g} and {b:g}, have no {rule} mean"
+                faults.append(f"{what}: give {name} of that pair in pairs, or another rule in mixing")
                 return None
         return found
 
