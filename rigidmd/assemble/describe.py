@@ -49,10 +49,8 @@ def _describe_body(system: BodySystem) -> str:
     pinned = "" if system.translates else ", pinned"
     moments = " ".join(f"{x:.9g}" for x in system.inertia)
     about = "the centre of mass" if system.translates else "the pivot"
-    lines = [
-        f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, "
-        f"{system.degrees_of_freedom} degrees of freedom"
-    ]
+    freedom = f"{system.degrees_of_freedom} degrees of freedom"
+    lines = [f"{scene.name}: one body, {system.kind}{pinned}, {system.mass:g} kg, {freedom}"]
     if system.rotates:
         lines.append(f"  principal moments about {about}: {moments} kg m²")
     if not np.array_equal(system.axes, np.eye(3)):

@@ -307,10 +307,9 @@ def _fit_group(
                 if (best := _search_order(points[0], molecule, c.allowed[-1], wide, MOST_TRIES // 10)) is not None:
                     off[k] = min(off[k], _fit(points[:, best], molecule).deviation[0])
             k = int(np.argmin(off / limits))
-            faults[m] = (
-                f"is not {species[candidates[k].species].name}: an atom is {off[k]:.3f} Å from the rigid template, "
-                f"more than {limits[k]:.3f} Å (structure.tolerance)"
-            )
+            limit = f"more than {limits[k]:.3f} Å (structure.tolerance)"
+            name = species[candidates[k].species].name
+            faults[m] = f"is not {name}: an atom is {off[k]:.3f} Å from the rigid template, {limit}"
 
 
 def _fit_in_any_order(

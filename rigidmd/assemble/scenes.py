@@ -6,7 +6,7 @@ The atoms of such a scene are an embedded structure file, extended XYZ with ever
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from rigidmd.io.formats import STRUCTURE
 from rigidmd.io.formats.cells import cell_error
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
 from rigidmd.scene import BodyScene, MolecularScene
+from rigidmd.scene.base import AnyScene
 from rigidmd.scene.molecules import Settings
 from rigidmd.scene.species import SPECIES_FILES
 
 if TYPE_CHECKING:
     import ase
 
-AnyScene = TypeVar("AnyScene", MolecularScene, BodyScene)
 DURATION = 1.0  # ps, of the stage of a scene without [[stages]]
 SOURCE = "atoms"  # in messages
 #: Constraints that a rigid molecule fulfils.
