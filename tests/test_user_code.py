@@ -542,6 +542,17 @@ def test_a_table_that_is_no_use_is_told(text, tmp_path):
         build(tabulated(tmp_path, sites=("AR",)))
 
 
+def test_a_table_that_overrides_another_may_be_anywhere(tmp_path, monkeypatch):
+    write_argon_table(tmp_path / "argon.csv")
+    tables = tabulated(tmp_path, sites=("AR",)).model_dump(exclude_unset=True)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    with pytest.raises(SceneError, match="there is no such file"):
+        rigidmd.Scene.from_dict(tables, "scene")
+    scene = rigidmd.Scene.from_dict(tables, "scene", {"forces.custom.0.table": "argon.csv"})
+    assert scene.inputs == {"forces.custom.0.table": tmp_path / "argon.csv"}
+
+
 def test_all_errors_of_a_table_are_told_and_its_file_is_in_the_folder(tmp_path):
     (tmp_path / "argon.csv").write_text("\n".join(["1 x"] * 9) + "\n" + ROWS)
     with pytest.raises(SceneError) as refused:
