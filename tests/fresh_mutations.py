@@ -103,7 +103,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F15", "step for a bias of averages: BAOAB's is taken for twice as large",
-        "run/pilot/shadow.py",
+        "run/pilot/sampling.py",
         "\"baoab\": 1 / 24}",
         "\"baoab\": 1 / 12}",
         ("test_auto.py::test_the_bias_asked_for_sets_the_step",),

@@ -207,7 +207,7 @@ def test_displacements_are_those_of_mdanalysis(water):
 @pytest.fixture(scope="module")
 def topology(water):
     """A GROMACS run input of the waters, written from our own molecules."""
-    system = read_record(water).molecules
+    system = read_record(water).system
     species = system.species[0]
     sites = {
         "position": system.site_positions(system.state).reshape(216, -1, 3), "template": species.positions_body,
@@ -594,9 +594,9 @@ def test_friction_on_each_molecule_is_told(water):
     record = read_record(water)
     assert "thermostat" not in " ".join(frames_of_folder(record, 0.02).notes)
     stages = tuple(s.model_copy(update={"ensemble": "nvt", "thermostat": "langevin"}) for s in record.scene.stages)
-    scene = record.molecules.scene.model_copy(update={"stages": stages})
+    scene = record.system.scene.model_copy(update={"stages": stages})
     columns = record.columns | {"stage_name": np.full(len(record.columns["time"]), "nvt")}
-    told = frames_of_folder(replace(record, system=replace(record.molecules, scene=scene), columns=columns), 0.02).notes
+    told = frames_of_folder(replace(record, system=replace(record.system, scene=scene), columns=columns), 0.02).notes
     assert "the thermostat langevin acts on each molecule" in " ".join(told)
 
 

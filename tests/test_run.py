@@ -18,19 +18,18 @@ from support import (
     BUILDS,
     COLUMNS,
     COMMANDS,
+    FIGURES,
     MOLECULES,
     NOW,
     REMOVED,
     ROOT,
     SCHEMES,
     Engine,
-    Figures,
     MolecularRecord,
     Sample,
     Samples,
     State,
     System,
-    body_observers,
     build,
     built,
     columns,
@@ -40,11 +39,11 @@ from support import (
     log,
     mean_and_error,
     minimise,
-    molecular_observers,
     molecular_run,
     observe,
     progress,
     rigidmd_command,
+    run_observers,
     shaken,
     small_scene,
     summarise,
@@ -1083,15 +1082,17 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
     def fail(*given, **options):
         raise ValueError("ParseException: no mathematics")
 
-    monkeypatch.setattr(molecular_observers, "save_figure", fail)
-    monkeypatch.setattr(body_observers, "write_motion_figures", fail)
+    monkeypatch.setattr(run_observers, "save_files", fail)
     pictures = [Failing("see", draws=True), Failing("end", draws=True)]
     notes = []
     results = Simulation(scene, tmp_path / "out", observers=pictures, warn=notes.append).run()
     assert not results.interrupted
     assert [note.split(" cannot be drawn: ValueError: ") for note in notes] == [
         ["Failing", "it does not work"],
-        [{"argon": "energy.png"}.get(kind, ", ".join(Figures().files())), "ParseException: no mathematics"],
+        [
+            {"argon": "energy.png"}.get(kind, ", ".join(f"{stem}.png, {stem}.svg" for stem in FIGURES)),
+            "ParseException: no mathematics",
+        ],
         ["Failing", "it does not work"],
     ]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -1102,12 +1103,12 @@ def test_a_picture_that_fails_is_a_note(tmp_path, scene_of_both, monkeypatch):
 
 
 def test_one_figure_of_a_body_that_fails_leaves_the_others(tmp_path, monkeypatch):
-    def fails_first(folder, figures, draw=body_observers.write_motion_figures):
-        if "axis" in figures:
+    def fails_first(figure, stem, suffixes, write=run_observers.save_files):
+        if stem.name == "axis":
             raise ValueError("no axis")
-        return draw(folder, figures)
+        return write(figure, stem, suffixes)
 
-    monkeypatch.setattr(body_observers, "write_motion_figures", fails_first)
+    monkeypatch.setattr(run_observers, "save_files", fails_first)
     scene = Scene.read(ROOT / "systems" / "heavy_top_3.toml", {"run.duration_s": 0.05, "output.interval_s": 0.001})
     results = Simulation(scene, tmp_path / "out", warn=str).run()
     assert {path.name for path in results.files} >= {"angles.png", "omega.png", "summary.json"}

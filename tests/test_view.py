@@ -97,7 +97,7 @@ def test_a_report_tells_of_a_body(top, capsys):
     text = (top / "report.html").read_text("utf-8")
     assert is_alone(text)
     assert "between 40.000000° and" in text
-    assert "error of L_z" in text
+    assert "L_z error" in text
     assert "report.html" in (top / ".rigidmd-run").read_text()  # which a new run there removes
 
 

@@ -200,7 +200,7 @@ def frames_of_folder(
     if record.is_body:
         what = "a run of a single body, and analyses are for molecules"
         raise OutputError(f"{record.folder} is {what}; `rigidmd report` shows it")
-    system, path = record.molecules, record.trajectory
+    system, path = record.system, record.trajectory
     most = max(2, MOST_NUMBERS // (3 * system.site_count + 18 * len(system.model.species)))
     frames = read_frames(path, system.site_count, most)
     tensor = read_tensor(record.folder / TENSOR_FILE)
@@ -234,7 +234,7 @@ def frames_of_results(results: Results, start: float | None = None) -> RigidFram
 
 def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
     """The last stage that is not a minimisation, and which samples are of its production. Raises OutputError."""
-    stage, _, last, begin, shown = _last_stage(record.molecules, record.columns)
+    stage, _, last, begin, shown = _last_stage(record.system, record.columns)
     time = record.columns["time"]
     return stage, shown & (time >= begin) & (time <= last)
 

@@ -1,17 +1,14 @@
 """Figures of a single body: path of its axis, Euler angles, ellipsoids, path in space, errors of the invariants."""
 
 # isort: skip_file
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file
 from rigidmd.engines.body_motion import Motion, drawn_axis
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import (
-    COOL, FAINT, INK, UP, WARM, camera, circle, draw_front_and_back, globe, new_figure, save_figure, settings,
-    thin_series,
+    COLORS, COOL, FAINT, INK, UP, WARM, camera, circle, draw_front_and_back, globe, new_figure, thin_series,
 )  # fmt: skip
 from rigidmd.mechanics.free_rotor import SplitRotor
 from rigidmd.mechanics.translation import InertialFrame
@@ -19,7 +16,6 @@ from rigidmd.mechanics.translation import InertialFrame
 if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
-SERIES = (COOL, WARM, "#4f8a5b", "#b8862d", "#7a5ca3", INK)
 NOTE = {"loc": "left", "fontsize": 9, "color": FAINT}
 DASHED = (0, (5, 4))
 LABELS = {"L_lab": "L in the lab", "L_size": "|L|", "L_z": "L_z", "L_3": "L_3"}
@@ -27,19 +23,6 @@ OMEGA = ("ω₁ (rad/s)", "ω₂ (rad/s)", "ω₃ (rad/s)")
 FIGURES = ("axis", "angles", "ellipsoids", "omega", "path", "invariants")
 #: Lines with more points are rasterised in the SVG; level at which an error of exactly 0 is drawn.
 MOST_POINTS, FLOOR = 10_000, 1e-17
-
-
-def write_motion_figures(folder: Path, figures: dict[str, "Picture"]) -> list[Path]:
-    """Write figures as PNG and SVG, with the same bytes for the same run. Returns the paths. Raises OutputError."""
-    written = []
-    for stem, figure in figures.items():
-        figure.lay_out(150)
-        with settings({"svg.hashsalt": stem}):
-            for suffix, options in (("png", {"dpi": 150}), ("svg", {"dpi": 100, "metadata": {"Date": None}})):
-                written.append(folder / f"{stem}.{suffix}")
-                with atomic_file(written[-1]) as temporary:
-                    save_figure(figure, temporary, **options)
-    return written
 
 
 def body_figures(system: BodySystem, samples: Motion) -> dict[str, "Picture"]:
@@ -243,7 +226,7 @@ def _invariants_figure(columns: dict[str, np.ndarray], invariants: list[str]):
         return None
     axis = (figure := new_figure(8, 4.6, title="errors of the invariants")).subplots()
     size = -(-len(columns["time"]) // 300)
-    for color, (label, error) in zip(SERIES * len(errors), errors.items(), strict=False):
+    for color, (label, error) in zip(COLORS, errors.items(), strict=False):
         largest = np.fmax.reduceat(error, np.arange(0, len(error), size))
         most = f"at most {np.nanmax(error):.1e}" if np.nanmax(error) > 0 else "exactly 0"
         axis.plot(columns["time"][::size], np.maximum(largest, FLOOR), color=color, lw=1.0, label=f"{label}: {most}")

@@ -1,7 +1,7 @@
 """Functions for all figures: writing, settings, styles of curves, thinning of long series, views of 3D objects."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -90,6 +90,17 @@ def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
             figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
         figure.lay_out(150)
         save_figure(figure, temporary, dpi=150)
+
+
+def save_files(figure: "Picture", stem: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Write a figure as files of these types, with the same bytes for the same figure. Raises OutputError."""
+    figure.lay_out(150)
+    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in suffixes]
+    for path in paths:
+        options = {"dpi": 100, "metadata": {"Date": None}} if path.suffix == ".svg" else {"dpi": 150}
+        with settings({"svg.hashsalt": stem.name}), atomic_file(path) as temporary:
+            save_figure(figure, temporary, **options)
+    return paths
 
 
 def new_figure(width: float, height: float, layout: Any = "constrained", title: str = "", **options) -> "Picture":

@@ -12,7 +12,7 @@ from rigidmd.errors import OutputError
 
 #: Names of files of a run. The scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
-FINAL, LAST_GOOD, ENERGY, SUMMARY = "final.npz", "last_good_state.npz", "energy.png", "summary.json"
+FINAL, LAST_GOOD, SUMMARY = "final.npz", "last_good_state.npz", "summary.json"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
 #: Marks the folder of a run and lists the files that the run may write, one per line. --force may remove them.
 MARKER = ".rigidmd-run"

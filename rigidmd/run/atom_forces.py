@@ -82,11 +82,12 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
 
 def _frame_indices(frame: int | slice | str, count: int) -> range | list[int]:
     """Indices of frames: a range for several, a list of one for an index. Raises IndexError, ValueError."""
+    from ase.utils import string2index
+
     wanted: Any = frame
     if isinstance(frame, str):
-        with contextlib.suppress(ValueError):
-            parts = [int(part) if part.strip() else None for part in frame.split(":")]
-            wanted = parts[0] if len(parts) == 1 else slice(*parts) if len(parts) < 4 else frame
+        with contextlib.suppress(ValueError, TypeError):
+            wanted = string2index(frame)
     if isinstance(wanted, slice) and wanted.step != 0:
         return range(count)[wanted]
     if not isinstance(wanted, int | np.integer):

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -18,7 +18,7 @@ from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced,
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import Engine, NotFiniteError
 from rigidmd.errors import SimulationError
-from rigidmd.figures.body import FIGURES, body_figures, write_motion_figures
+from rigidmd.figures.body import FIGURES
 from rigidmd.forces.body.applied import SteadyForce
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import MOTION, MOTION_NPZ
@@ -26,7 +26,7 @@ from rigidmd.io.formats import format_of
 from rigidmd.io.write import write_columns, write_npz
 from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
-from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
+from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import fastest_body_rate
 from rigidmd.run.report import body_summary_text
@@ -195,23 +195,6 @@ class MotionFiles(Observer):
         return f". The motion so far: {run.path(MOTION)}"
 
 
-class Figures(Observer):
-    """Figures of the axis, angles, omega and errors."""
-
-    draws = True
-    _names = tuple(f"{figure}.{suffix}" for figure in FIGURES for suffix in ("png", "svg"))
-
-    def end(self, run: "Simulation", results: "Results") -> None:
-        failed = None
-        for stem, figure in body_figures(run.system, cast(Motion, results.samples)).items():
-            try:
-                results.files += write_motion_figures(run.path(""), {stem: figure})
-            except Exception as error:  # of many types; the other figures are drawn first
-                failed = failed or error
-        if failed is not None:
-            raise failed
-
-
 @dataclass
 class BodyRecord(RunRecord):
     """The record of a run of a body."""
@@ -313,7 +296,7 @@ class BodyRun(RunPart):
             files = [Frames(interval, not_none(output.topology), output.trajectory, velocities)]
         if self.simulation.folder is not None:
             files = [SceneFile(), *files, MotionFiles(self._sampler, output.npz)]
-            files += [Figures()] if output.figures else []
+            files += [Figures(FIGURES, ("png", "svg"))] if output.figures else []
         return [*files, self._sampler, self._watch]
 
     def samples(self) -> Motion:

@@ -31,8 +31,8 @@ from rigidmd.run import checks
 from rigidmd.run.force_errors import check_forces, coulomb_errors
 from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
-from rigidmd.run.molecular_observers import EnergyFigure, FinalState, LogFile, PressureTensor, Sampler, StepWatch
-from rigidmd.run.observers import Frames, Moment, Observer, SceneFile
+from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
+from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.report import summary_text
@@ -295,8 +295,7 @@ class MolecularRun(RunPart):
 
     def _choose(self, k: int) -> None:
         """Choose integrator and step of a stage by pilot runs from the present state, and set them in the scene."""
-        from rigidmd.run.pilot.acceptance import choose_for_sampling
-        from rigidmd.run.pilot.shadow import choose_for_averages
+        from rigidmd.run.pilot.sampling import choose_for_averages, choose_for_sampling
         from rigidmd.run.pilot.trial_systems import choose_for_molecules
 
         stage = self.scene.stages[k]
@@ -358,7 +357,7 @@ class MolecularRun(RunPart):
         if self.simulation.folder is not None:
             names = input_names(self.scene)
             files = [SceneFile(names.values()), *files, LogFile(interval, output.pressure_tensor), FinalState()]
-            files += [EnergyFigure()] if output.figures else []
+            files += [Figures(["energy"], ["png"])] if output.figures else []
         return [*files, self._sampler, *watch]
 
     def samples(self) -> Samples:

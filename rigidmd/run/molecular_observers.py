@@ -1,18 +1,15 @@
-"""Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state, energy.png."""
+"""Observers of molecules: samples and their checks, log.csv, pressure_tensor.csv, the final state."""
 
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file
 from rigidmd.core.state import NOW, Load, State
 from rigidmd.core.state_file import write_state
 from rigidmd.engines.samples import Samples
-from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import save_figure
 from rigidmd.io.checkpoint import Checkpoint
-from rigidmd.io.folder import ENERGY, FINAL, LAST_GOOD, LOG
+from rigidmd.io.folder import FINAL, LAST_GOOD, LOG
 from rigidmd.io.run_files import TENSOR_FILE, Log, TensorFile, tensor_row
 from rigidmd.run import checks
 from rigidmd.run.observers import GrowingFile, Moment, Observer
@@ -183,17 +180,3 @@ class FinalState(Observer):
     def end(self, run: "Simulation", results: "Results") -> None:
         write_state(run.path(FINAL), run.system.saved(run.state))
         results.files.append(run.path(FINAL))
-
-
-class EnergyFigure(Observer):
-    """energy.png: drift, energies and temperatures."""
-
-    draws = True
-    _names = (ENERGY,)
-
-    def end(self, run: "Simulation", results: "Results") -> None:
-        for figure in run_figures(run.system, results.samples, results.summary).values():
-            figure.lay_out(150)
-            with atomic_file(run.path(ENERGY)) as temporary:
-                save_figure(figure, temporary, dpi=150)
-            results.files.append(run.path(ENERGY))

@@ -16,6 +16,8 @@ import numpy as np
 from pydantic import Field
 
 from rigidmd.core.state import NOW, State
+from rigidmd.figures.run import run_figures
+from rigidmd.figures.style import save_files
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats.atoms import Frame
@@ -197,6 +199,25 @@ class SceneFile(Observer):
 
     def end(self, run: "Simulation", results: "Results") -> None:
         results.files.append(run.path(SCENE))
+
+
+class Figures(Observer):
+    """Figures of the run, by the stems and the types of their files."""
+
+    draws = True
+
+    def __init__(self, stems: Sequence[str], suffixes: Sequence[str]):
+        self._suffixes, self._names = suffixes, [f"{stem}.{suffix}" for stem in stems for suffix in suffixes]
+
+    def end(self, run: "Simulation", results: "Results") -> None:
+        failed = None
+        for stem, figure in run_figures(run.system, results.samples, results.summary).items():
+            try:
+                results.files += save_files(figure, run.path(stem), self._suffixes)
+            except Exception as error:  # of many types; the other figures are drawn first
+                failed = failed or error
+        if failed is not None:
+            raise failed
 
 
 class Frames(GrowingFile):

@@ -15,7 +15,6 @@ from rigidmd.engines import samples
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import BODY, BODY_COLUMNS
-from rigidmd.engines.system import System
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
@@ -39,7 +38,7 @@ class Record:
 
     folder: Path
     scene: MolecularScene | BodyScene
-    system: System | BodySystem
+    system: Any  # a `System`, or a `BodySystem` for a body
     summary: dict[str, Any] | None
     columns: dict[str, np.ndarray]
     missing: list[str]
@@ -47,20 +46,6 @@ class Record:
     @property
     def is_body(self) -> bool:
         return isinstance(self.scene, BodyScene)
-
-    @property
-    def body(self) -> BodySystem:
-        """The system of a single body. Raises TypeError for molecules."""
-        if not isinstance(self.system, BodySystem):
-            raise TypeError("this is a run of molecules")
-        return self.system
-
-    @property
-    def molecules(self) -> System:
-        """The system of molecules. Raises TypeError for a single body."""
-        if not isinstance(self.system, System):
-            raise TypeError("this is a run of a single body")
-        return self.system
 
     @property
     def time(self) -> np.ndarray:

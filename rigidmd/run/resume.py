@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,11 @@ from rigidmd.scene import MolecularScene, Scene
 
 #: Packages that may change the last bits of a result.
 PACKAGES = ("rigidmd", "numba", "llvmlite", "numpy")
+#: Keys of a summary on programs and machine.
+MADE_WITH = (
+    *(f"{package}_version" for package in PACKAGES), "python_version", "machine", "processor", "vector_bits",
+    "numba_settings", "threads",
+)  # fmt: skip
 #: Keys that change no bit of a run, or, as input files, are compared by contents.
 NOT_COMPARED = ("name", "threads", "output.checkpoint_minutes", "output.figures", "output.drawn_as", "watch")
 
@@ -58,10 +63,14 @@ def scene_digest(scene: Scene) -> str:
     return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()
 
 
-def input_digests(scene: Scene) -> dict[str, str]:
+def file_digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def input_digests(scene: Scene, file_digest: Callable[[Path], str] = file_digest) -> dict[str, str]:
     """SHA-256 of each input of a scene, a file or its contents, by its dotted key. Raises SceneError."""
     try:
-        read = {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in scene.inputs.items()}
+        read = {key: file_digest(path) for key, path in scene.inputs.items()}
     except OSError as error:
         raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
     return read | {key: hashlib.sha256(content).hexdigest() for key, content in scene.embedded_files.items()}

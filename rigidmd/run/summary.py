@@ -1,7 +1,7 @@
 """The summary of a run, of molecules or of a single body: one dictionary with units in its keys, and its notes."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import isnan, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -269,19 +269,16 @@ def _stage(system: System, samples: Samples, k: int, computing: float, moves: tu
     earlier = system.scene.stages[k - 1] if k else stage
     if stage.ensemble == "nve" and earlier.has_thermostat and len(steady) >= MIN_SAMPLES:
         values["temperature_before_K"] = earlier.temperatures[1]
-        values["temperature_scatter_K"] = _temperature_scatter(steady["temperature"], system.freedom_in(k).total)
+        # standard deviation of the mean temperatures of such stages that start from states of a canonical ensemble, see
+        # "Temperatures after a thermostat" in the theory chapter `errors`; None if sampling hides it
+        level, freedom = steady["temperature"], system.freedom_in(k).total
+        square = 2 * level.mean() ** 2 / freedom - level.var() if freedom else 0.0
+        values["temperature_scatter_K"] = sqrt(square) if square > 0 else None
     if stage.is_hybrid:
         values |= {"trajectories": steps // stage.steps_together} | _means(steady, HYBRID)
     if stage.volume:
         values |= _means(equilibrated(before, earlier), {"volume": "nm3"}) | {"volume_before_nm3": first.volume}
     return values
-
-
-def _temperature_scatter(temperature: np.ndarray, freedom: int) -> float | None:
-    """Standard deviation (K) of the mean temperatures of nve stages that start from states of a canonical ensemble, see
-    "Temperatures after a thermostat" in the theory chapter `errors`. None if sampling hides it."""
-    square = 2 * temperature.mean() ** 2 / freedom - temperature.var() if freedom else 0.0
-    return sqrt(square) if square > 0 else None
 
 
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
@@ -343,7 +340,6 @@ def summarise_body(
     """The summary of a run of a single body, without its `provenance`. planned : steps of a run that ends in time"""
     run, end = system.scene.run, float(motion["time"][-1])
     steps = round(end / run.timestep_s) if interrupted else planned
-    angles = np.degrees([motion["theta"].min(), motion["theta"].max()]).tolist() if system.rotates else None
     notes = system.notes
     if "energy" in motion.invariants and (error := np.abs(motion["energy_error"]).max()) > LARGE_ENERGY_ERROR:
         wrong = f"the energy is wrong by {error:.1e} of the largest kinetic energy"
@@ -361,9 +357,17 @@ def summarise_body(
         "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
         "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
         "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
-        "energy_start_J": float(motion["energy"][0]), "energy_end_J": float(motion["energy"][-1]),
-        "work_J": float(motion["work"][-1]),
-        "largest_relative_error": {name: float(np.abs(motion[f"{name}_error"]).max()) for name in motion.invariants},
-        "largest_orthogonality_error": float(motion["orthogonality_error"].max()) if system.rotates else None,
-        "theta_range_deg": angles, "trajectory_A_per_m": system.scale, "notes": notes,
+        **motion_figures(motion.columns, motion.invariants), "trajectory_A_per_m": system.scale, "notes": notes,
+    }  # fmt: skip
+
+
+def motion_figures(columns: Mapping[str, np.ndarray], invariants: Iterable[str]) -> dict:
+    """The part of the summary of a body that follows from the columns of its motion."""
+    theta, orthogonality = columns.get("theta"), columns.get("orthogonality_error")
+    return {
+        "energy_start_J": float(columns["energy"][0]), "energy_end_J": float(columns["energy"][-1]),
+        "work_J": float(columns["work"][-1]),
+        "largest_relative_error": {name: float(np.abs(columns[f"{name}_error"]).max()) for name in invariants},
+        "largest_orthogonality_error": None if orthogonality is None else float(orthogonality.max()),
+        "theta_range_deg": None if theta is None else np.degrees([theta.min(), theta.max()]).tolist(),
     }  # fmt: skip

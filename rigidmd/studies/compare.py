@@ -15,13 +15,9 @@ from rigidmd.core.toml import read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
 from rigidmd.io.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
 from rigidmd.io.run_files import Columns, Summary, read_columns, read_json
-from rigidmd.run.resume import differences, keys_of
+from rigidmd.io.write import columns_text
+from rigidmd.run.resume import MADE_WITH, differences, keys_of
 
-#: Keys of summary.json that are compared besides the scene.
-VERSIONS_AND_MACHINE = (
-    "rigidmd_version", "numba_version", "llvmlite_version", "numpy_version", "python_version", "machine", "processor",
-    "vector_bits", "numba_settings", "threads",
-)  # fmt: skip
 #: Columns by which samples are matched: steps if they have the same times in both files, else times.
 STEP, TIMES = "Step", ("Time (ps)", "t")
 BITS = 53  # bits of the significand of a float64
@@ -100,7 +96,7 @@ def compare(first: Path, second: Path) -> RunComparison:
     if summaries := both(SUMMARY, lambda path: read_json(path, Summary)):
         made = []
         for there in (summary.model_dump(exclude_unset=True) for summary in summaries):
-            of_run = {key.replace("_", " "): there[key] for key in VERSIONS_AND_MACHINE if key in there}
+            of_run = {key.replace("_", " "): there[key] for key in MADE_WITH if key in there}
             of_run |= {f"processor has {feature}": True for feature in there.get("processor_features", ())}
             made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
         found.made = differences(made[0], made[1], "not recorded")
@@ -189,10 +185,7 @@ def describe_run_comparison(found: RunComparison) -> str:
     elif found.samples is not None and found.samples.file == LOG and not any(FINAL in text for text in found.missing):
         rows.append((FINAL, ["the same to the last bit"]))
     rows += [("missing", [text]) for text in found.missing]
-    width = max(len(name) for name, _ in rows)
-    lines = [f"{one} and {other}"]
-    for name, texts in rows:
-        lines += [f"  {head:<{width}}  {text}" for head, text in zip((name, *[""] * len(texts)), texts, strict=False)]
+    cells = [("", "" if k else name, text) for name, texts in rows for k, text in enumerate(texts)]
     verdict, samples = "the runs are not the same", found.samples
     if found.same:
         verdict = "the runs are the same to the last bit"
@@ -200,7 +193,7 @@ def describe_run_comparison(found: RunComparison) -> str:
         verdict = f"the runs diverge at {samples.clock} {samples.at}, sample {samples.index + 1} of {samples.common}"
     elif samples is not None and samples.lengths != (samples.common, samples.common):
         verdict = "the runs are the same to the last bit as far as both have samples"
-    return "\n".join([*lines, "", verdict])
+    return "\n".join([f"{one} and {other}", columns_text(cells, left=(0, 1, 2)), "", verdict])
 
 
 def _describe_samples(samples: SampleComparison) -> list[str]:
@@ -217,9 +210,9 @@ def _describe_samples(samples: SampleComparison) -> list[str]:
 
 
 def _describe_cells(unlike: list[CellDifference]) -> list[str]:
-    width = max(len(cell.column) for cell in unlike)
-    return [
-        f"  {cell.column:<{width}}  {cell.first or 'nothing'} and {cell.second or 'nothing'}"
-        + (f"  last {cell.bits} of {BITS} bits" if cell.bits else "")
+    rows = [
+        ("", cell.column, f"{cell.first or 'nothing'} and {cell.second or 'nothing'}"
+         + (f"  last {cell.bits} of {BITS} bits" if cell.bits else ""))
         for cell in unlike
-    ]
+    ]  # fmt: skip
+    return columns_text(rows, left=(0, 1, 2)).splitlines()

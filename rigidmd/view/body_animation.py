@@ -46,7 +46,7 @@ class BodyAnimation:
 
     def __init__(self, record: Record):
         self._record = record
-        system, seen, count = record.body, record.columns, len(record.time)
+        system, seen, count = record.system, record.columns, len(record.time)
         stride = -(-count // MOST_SAMPLES)
         rows = np.arange(0, count, stride)
         self.time = record.time[rows]
@@ -206,10 +206,11 @@ class BodyAnimation:
         return [note] if turns > MAX_ROTATION else []
 
     def page_part(self) -> PagePart:
+        short = lambda values: values.astype("<f4")  # noqa: E731
         data = {
-            "time": self.time, "quaternion": _short(self.quaternion), "position": _short(self.position),
-            "path": _short(self.path), "when": self.when, "angles": _short(self.angles) if self.angles.size else None,
-            "vectors": {name: _short(values) for name, values in self.vectors.items()},
+            "time": self.time, "quaternion": short(self.quaternion), "position": short(self.position),
+            "path": short(self.path), "when": self.when, "angles": short(self.angles) if self.angles.size else None,
+            "vectors": {name: short(values) for name, values in self.vectors.items()},
             "gravity": None if self.gravity is None else self.gravity.tolist(),
             "vertices": self.mesh.vertices.round(6).tolist(), "faces": self.mesh.faces, "painted": self.mesh.painted,
             "sphere": self.sphere, "axis": self.axis.tolist(), "centre": self.centre.tolist(), "pinned": self.pinned,
@@ -225,7 +226,3 @@ class BodyAnimation:
         usage += " A click on a plot jumps to it."
         picture = '<canvas id="film" role="img" aria-label="film of the body"></canvas>'
         return PagePart(picture, legend, usage, data, self.notes, [read_asset("film.js"), read_asset("body.js")])
-
-
-def _short(values: np.ndarray) -> np.ndarray:
-    return values.astype("<f4")

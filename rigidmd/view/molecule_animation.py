@@ -36,7 +36,7 @@ def chemiscope_script() -> str:
 def frames_of(record: Record, most: int) -> Frames:
     """Frames of the trajectory of a run of molecules, each molecule whole and inside the box. Raises OutputError if
     distances within molecules are not as in the molecules of this run."""
-    path, sites = record.trajectory, record.molecules.sites
+    path, sites = record.trajectory, record.system.sites
     found = read_frames(path, len(sites.molecule), most)
     pairs = np.flatnonzero(sites.molecule[1:] == sites.molecule[:-1])
     wanted, seen = (np.linalg.norm(at[pairs + 1] - at[pairs], axis=1) for at in (sites.offset_body, found.positions[0]))
@@ -87,7 +87,7 @@ class MoleculeAnimation:
     def __init__(self, record: Record, most_frames: int | None = None):
         from matplotlib.colors import to_rgb
 
-        self._record, sites = record, record.molecules.sites
+        self._record, sites = record, record.system.sites
         self._shown = np.flatnonzero(sites.mass > 0)
         self._frames = frames_of(record, most_frames or max(2, MOST_COORDINATES // (3 * len(self._shown))))
         self.time, self.notes = self._frames.time, describe_thinning(self._frames)
@@ -151,7 +151,7 @@ class MoleculeAnimation:
 
     def page_part(self) -> PagePart:
         """The animation by chemiscope. Raises OutputError."""
-        code, frames, molecules = chemiscope_script(), self._frames, self._record.molecules
+        code, frames, molecules = chemiscope_script(), self._frames, self._record.system
         positions = frames.positions[:, self._shown]
         left_out = ["Sites without mass are not drawn."] if len(self._shown) < len(molecules.sites.mass) else []
         low, high = positions.min(), positions.max()

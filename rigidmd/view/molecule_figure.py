@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file
-from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_figure, settings
+from rigidmd.figures.style import COOL, FAINT, INK, draw_scale, new_figure, save_files
 from rigidmd.io.formats.bonds import COVALENT, bonds, distance
 from rigidmd.io.write import check_target
 from rigidmd.scene.models import GROUPS, Molecule
@@ -148,8 +147,7 @@ def write_molecule_figure(path: Path, m: Molecule, force: bool = False) -> None:
     ]  # fmt: skip
     lines.append("; ".join(text for text, there in legend if there))
     figure.text(0.03, 0.942, "\n".join(lines), fontsize=FONT, linespacing=1.35, **plain)
-    with settings({"svg.hashsalt": m.name}), atomic_file(path) as temporary:
-        save_figure(figure, temporary, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+    save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
 
 def _view(m: Molecule) -> np.ndarray:

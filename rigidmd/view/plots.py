@@ -2,6 +2,7 @@
 
 import time as clock
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -13,7 +14,7 @@ from rigidmd.engines.samples import BODY_COLUMNS, MATRIX, Column, Samples
 from rigidmd.engines.system import System
 from rigidmd.figures.picture import Picture
 from rigidmd.figures.run import run_figures
-from rigidmd.figures.style import COOL, FAINT, INK, WARM, new_figure, open_axis, shown_range, thin_series
+from rigidmd.figures.style import COLORS, FAINT, INK, new_figure, open_axis, shown_range, thin_series
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.record import Record
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 #: Inches: narrow, to be readable on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
-COLORS = (COOL, WARM, "#4f8a5b", "#7a5ca3", "#b8862d")
 #: Errors of exactly 0 are drawn at this value.
 FLOOR = 1e-17
 
@@ -46,7 +46,7 @@ def panels(record: Record) -> list[Panel]:
 
 
 def _molecular_panels(record: Record) -> list[Panel]:
-    seen, n, shown = record.columns, len(record.molecules.model.species), record.moving
+    seen, n, shown = record.columns, len(record.system.model.species), record.moving
 
     def curves(per: int = 1, **labels: str) -> list[tuple[str, np.ndarray]]:
         there = [name for name in labels if name in seen and np.isfinite(seen[name][shown]).any()]
@@ -75,7 +75,7 @@ def _body_panels(record: Record) -> list[Panel]:
         found.append(Panel(f"φ and ψ ({unit})", [(name, values / size) for name, values in angles]))
         omega = [("ω" + "₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
         found.append(Panel("ω along the body's axes (rad/s)", omega))
-    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.body.translates:
+    if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.system.translates:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
     found.append(Panel("energies (J)", parts))
@@ -109,7 +109,7 @@ def draw_panel(axis, record: Record, panel: Panel) -> None:
     """Draw the curves of a panel, without minimisations, with the beginnings of stages."""
     shown, ranges = record.moving, []
     time, stages = record.time[shown], record.columns.get("stage", np.zeros(len(shown)))[shown]
-    for color, (label, values) in zip(COLORS * len(panel.curves), panel.curves, strict=False):
+    for color, (label, values) in zip(cycle(COLORS), panel.curves, strict=False):
         axis.plot(*thin_series(time, values[shown], 600), color=color, lw=0.9, label=label or None)
         ranges.append(None if panel.log or record.is_body else shown_range(values[shown], stages))
     if panel.log:
@@ -136,11 +136,8 @@ def record_of(
     names: Sequence[str] | None = None,
 ) -> Record:  # fmt: skip
     """A run in memory as a record, with all its columns or with the named ones and the time."""
-    if isinstance(samples, Motion):
-        columns = samples.columns if names is None else {name: samples.columns[name] for name in ["time", *names]}
-    else:
-        wanted = samples.described if names is None else dict.fromkeys(["time", "stage", *names])
-        columns = {name: samples[name] for name in wanted}
+    wanted = samples.described if names is None else ("time", "stage", *names)
+    columns = {name: samples[name] for name in wanted if name in samples.described and name != MATRIX}
     return Record(Path(), system.scene, system, summary, columns, [])
 
 

@@ -18,14 +18,16 @@ from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
-from rigidmd.engines.samples import describe_equilibrated, equilibrated_from
+from rigidmd.engines.samples import BODY, describe_equilibrated, equilibrated_from
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
-from rigidmd.run.report import set_point
+from rigidmd.run.report import body_rows, set_point
+from rigidmd.run.resume import MADE_WITH
+from rigidmd.run.summary import motion_figures
 from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation
@@ -38,14 +40,6 @@ MEANS = (
     ("temperature", "T (K)", False), ("temperature_translation", "T_trans (K)", False),
     ("temperature_rotation", "T_rot (K)", False), ("potential", "U (kJ/mol per molecule)", True),
     ("pressure_bar", "P (bar)", False), ("density", "density (g/cm³)", False),
-)  # fmt: skip
-#: Keys of a summary on programs, machine and input, and their titles.
-PROVENANCE = (
-    ("rigidmd_version", "rigidmd"), ("numba_version", "Numba"), ("llvmlite_version", "llvmlite"),
-    ("numpy_version", "NumPy"), ("python_version", "Python"), ("machine", "machine"), ("processor", "processor"),
-    ("vector_bits", "bits of a vector"), ("numba_settings", "settings of Numba"), ("threads", "threads"),
-    ("precision", "precision"), ("seed", "seed"), ("scene_sha256", "SHA-256 of the scene"),
-    ("input_sha256", "SHA-256 of the files that it read"),
 )  # fmt: skip
 #: Files of a run: name -> contents.
 ABOUT = {
@@ -93,14 +87,14 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
 
 
 def _means(record: Record) -> str:
-    n, seen = len(record.molecules.model.species), record.columns
+    n, seen = len(record.system.model.species), record.columns
     shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
     rows = []
     for k in np.unique(seen["stage"][record.moving]):
         of_stage = np.flatnonzero(seen["stage"] == k)
         time = seen["time"][of_stage]
         begin = float(seen["time"][max(0, of_stage[0] - 1)])
-        values, stage = {name: column[of_stage] for name, column in seen.items()}, record.molecules.scene.stages[k]
+        values, stage = {name: column[of_stage] for name, column in seen.items()}, record.system.scene.stages[k]
         start, given = equilibrated_from(values, stage), [(stage.temperature_K, "K"), (stage.pressure_bar, "bar")]
         set_points = "; ".join(filter(None, (set_point(value, unit) for value, unit in given)))
         cells = [stage.label, describe_equilibrated(values, stage, begin), len(time) - start, set_points]
@@ -164,21 +158,10 @@ def _number(value: float | None) -> str:
 
 
 def _body_table(record: Record) -> str:
-    seen = record.columns
-    rows = [["time", f"{record.time[-1]:g} s, {len(record.time)} samples"]]
-    rows.append(["energy", f"{seen['energy'][0]:.9g} J at the start, {seen['energy'][-1]:.9g} J at the end"])
-    if seen["work"].any():
-        rows.append(["work", f"{seen['work'][-1]:.9g} J done on the body"])
-    if "theta" in seen:
-        low, high = np.degrees([seen["theta"].min(), seen["theta"].max()])
-        rows.append(["θ", f"between {low:.6f}° and {high:.6f}°"])
-    for name in ("energy", "L_lab", "L_size", "L_x", "L_y", "L_z", "L_1", "L_2", "L_3"):
-        if (key := f"{name}_error") in seen:
-            of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
-            rows.append([f"error of {name}", f"at most {np.abs(seen[key]).max():.1e} of {of}"])
-    if "orthogonality_error" in seen:
-        rows.append(["orthogonality", f"|QᵀQ - 1| at most {seen['orthogonality_error'].max():.1e}"])
-    return table([], rows, words=True)
+    of_invariants = BODY["energy_error"].names + BODY["L_error"].names
+    errors = [name.removesuffix("_error") for name in record.columns if name in of_invariants]
+    time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
+    return table([], [time, *body_rows(motion_figures(record.columns, errors))], words=True)
 
 
 def _margins(record: Record) -> str:
@@ -226,10 +209,10 @@ def _repeat(record: Record) -> Iterator[str]:
         f"rigidmd compare {folder} {folder}-again    # to the same bits"
     )
     rows = []
-    for key, name in PROVENANCE:
+    for key in (*MADE_WITH, "precision", "seed", "scene_sha256", "input_sha256"):
         if isinstance(value := summary.get(key), dict):
             value = ", ".join(f"{path} {digest}" for path, digest in value.items())
-        rows += [[name, value]] if value else []
+        rows += [[key.replace("_", " "), value]] if value else []
     yield table([], rows, words=True)
     about = {"preparing_s": "to compile and prepare", "computing_s": "of steps", "wall_s": "in all, output included"}
     seconds = [f"{summary[key]:.1f} s {phase}" for key, phase in about.items() if summary.get(key)]

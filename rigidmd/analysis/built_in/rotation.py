@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy import signal
+from scipy.spatial.transform import Rotation
 
 from rigidmd.analysis.built_in.transport import correlation, interval_and_lags, squared_displacement
 from rigidmd.analysis.registry import built_in
@@ -48,8 +49,8 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
     curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0)
     found.curves.append(curve)
     for kind in kinds:
-        if note := _describe_axes(kind):
-            found.notes.append(note)
+        if (along := _axis_along_dipole(kind)) is not None:
+            found.notes.append(f"axis {along + 1} of {kind.name} is along its dipole")
         for axis in _axes(kind):
 
             def compute(part: RigidFrames, group: Kind, axis=axis) -> np.ndarray:
@@ -85,15 +86,12 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
     return found
 
 
-def _describe_axes(kind: Kind) -> str:
-    """A note on the axis along the dipole of a molecule."""
+def _axis_along_dipole(kind: Kind) -> int | None:
+    """The principal axis along the dipole of a neutral molecule, or None."""
     dipole = kind.molecule.charges @ kind.molecule.positions_body
-    if kind.molecule.charge or not kind.molecule.has_dipole:
-        return ""
     along = int(np.abs(dipole).argmax())
-    if abs(dipole[along]) < (1 - 1e-6) * float(np.linalg.norm(dipole)):
-        return ""
-    return f"axis {along + 1} of {kind.name} is along its dipole"
+    is_along = abs(dipole[along]) >= (1 - 1e-6) * float(np.linalg.norm(dipole))
+    return along if is_along and kind.molecule.has_dipole and not kind.molecule.charge else None
 
 
 def _integral(values: np.ndarray, interval: float) -> float:
@@ -113,12 +111,7 @@ def _rotations(frames: RigidFrames, kind: Kind) -> np.ndarray:
     """Rotation vectors between frames along the body's axes (f - 1, k, 3), rad."""
     Q = frames.Q[:, kind.index]
     between = np.einsum("fnji,fnjk->fnik", Q[:-1], Q[1:])
-    skew = 0.5 * np.stack(
-        [between[..., (i + 2) % 3, (i + 1) % 3] - between[..., (i + 1) % 3, (i + 2) % 3] for i in range(3)], axis=-1
-    )
-    sine = np.linalg.norm(skew, axis=-1)
-    angle = np.arctan2(sine, 0.5 * (np.einsum("fnii->fn", between) - 1))
-    return skew * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 1.0)[..., None]
+    return Rotation.from_matrix(between.reshape(-1, 3, 3)).as_rotvec().reshape(*between.shape[:2], 3)
 
 
 def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags: int) -> list[Value]:

@@ -44,13 +44,13 @@ def rdf(
         asked = f"g(r) up to {largest:g} Å in bins of {width:g} Å"
         raise OutputError(f"{asked} is not possible: half the box is {half:.4g} Å")
     pairs = [(first, second or first)] if first else _pairs(frames)
-    thinned = _thinned(frames, ENOUGH_MOLECULES)
+    thinned, notes = _thinned(frames, ENOUGH_MOLECULES)
     bins = int(largest / width + 1e-9)
     edges = width * np.arange(bins + 1)
     shells = 4 / 3 * np.pi * np.diff(edges**3)
     r = 0.5 * (edges[1:] + edges[:-1])
     curve = Curve("rdf", ("r (A)", r), "g(r)", {}, level=1.0)
-    found = AnalysisResult("rdf", "radial distribution functions", curves=[curve])
+    found = AnalysisResult("rdf", "radial distribution functions", curves=[curve], notes=notes)
     for a, b in pairs:
         if _pair_count(thinned, a, b) == 0:
             found.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
@@ -66,15 +66,14 @@ def rdf(
         if len(parts) > 1:
             curve.errors[title] = error_of_mean(parts)
         found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, thinned.span / max(1, len(thinned) - 1))
-    if len(thinned) < len(frames):
-        found.notes.append(f"of {len(thinned)} of {len(frames)} frames, evenly spaced")
     return found
 
 
-def _thinned(frames: RigidFrames, enough: int) -> RigidFrames:
-    """Evenly spaced frames with about `enough` molecules in total."""
+def _thinned(frames: RigidFrames, enough: int) -> tuple[RigidFrames, list[str]]:
+    """Evenly spaced frames with about `enough` molecules in total, and a note if these are not all frames."""
     most = min(MOST, max(FEWEST, enough // len(frames.system.model.species)))
-    return frames[:: max(1, -(-len(frames) // most))]
+    found = frames[:: max(1, -(-len(frames) // most))]
+    return found, [f"of {len(found)} of {len(frames)} frames, evenly spaced"] if len(found) < len(frames) else []
 
 
 def _split(values: np.ndarray) -> list[np.ndarray]:
@@ -178,7 +177,7 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
     centres of all molecules. largest : 1/Å. Raises OutputError."""
     if not frames.has_box:
         raise OutputError("a structure factor needs a box")
-    thinned = _thinned(frames, ENOUGH_MOLECULES_K)
+    thinned, notes = _thinned(frames, ENOUGH_MOLECULES_K)
     reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
@@ -197,7 +196,8 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
     title = f"S {name or 'centres'}"
     curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: values.mean(axis=0)}, level=1.0)
     parts = [part.mean(axis=0) for part in _split(values)]
-    found = AnalysisResult("structure_factor", "structure factor", curves=[curve])
+    vectors_used = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
+    found = AnalysisResult("structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used])
     if len(parts) > 1:
         curve.errors[title] = error_of_mean(parts)
         top = int(np.argmax(curve.columns[title]))
@@ -205,9 +205,6 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
         note = f"at {length[top]:.2f} 1/Å, bins of {K_WIDTH} 1/Å"
         tau = correlation_time(values[:, top], thinned.span / (len(thinned) - 1))
         found.values.append(Value("highest peak of S(k)", "1", height, error, tau, note))
-    if len(thinned) < len(frames):
-        vectors = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
-        found.notes.append(f"of {len(thinned)} of {len(frames)} frames, and {vectors}")
     return found
 
 
@@ -270,7 +267,7 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
     if not any(_donors(kind.molecule) for kind in frames.kinds):
         why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
         raise OutputError(f"{why}: there are no hydrogen bonds")
-    thinned = _thinned(frames, ENOUGH_MOLECULES)
+    thinned, notes = _thinned(frames, ENOUGH_MOLECULES)
     number = len(frames.system.model.species)
     bonds = np.array([_bonds(thinned, k, distance, angle) for k in range(len(thinned))])  # (f, n)
     each = bonds.mean(axis=1)
@@ -279,11 +276,10 @@ def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: 
     fraction = np.array([np.mean(bonds == k) for k in range(most)])
     axis = ("hydrogen bonds", np.arange(most))
     curve = Curve("hydrogen_bonds", axis, "fraction of molecules", {"share": fraction}, bars=True)
-    note = [f"of {len(thinned)} of {len(frames)} frames"] if len(thinned) < len(frames) else []
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
     tau = correlation_time(each, thinned.span / (len(thinned) - 1))
     found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
-    return AnalysisResult("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], note)
+    return AnalysisResult("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], notes)
 
 
 def _donors(molecule: Molecule) -> list[tuple[int, int]]:
@@ -300,8 +296,8 @@ def _donors(molecule: Molecule) -> list[tuple[int, int]]:
 
 def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np.ndarray:
     """Hydrogen bonds of each molecule (n,) in a frame."""
-    heavy, owner, giver, arm = [], [], [], []
-    offset = 0
+    heavy, owner, arms = [], [], []  # arms (sites, 3) to the first hydrogen of each, the second, ...; NaN without one
+    most = len(max((_donors(kind.molecule) for kind in frames.kinds), key=len))
     for kind in frames.kinds:
         centre = frames.positions[frame, kind.index]
         rotation = frames.Q[frame, kind.index] if frames.Q.shape[1] else np.eye(3)[None]
@@ -309,26 +305,20 @@ def _bonds(frames: RigidFrames, frame: int, distance: float, angle: float) -> np
         for site in (k for k, element in enumerate(kind.molecule.elements) if element in BONDING):
             heavy.append(centre + rotation @ body[site])
             owner.append(kind.index)
-            for donor, hydrogen in _donors(kind.molecule):
-                if donor == site:
-                    giver.append(offset + np.arange(len(kind.index)))
-                    arm.append(np.broadcast_to(rotation @ (body[hydrogen] - body[site]), centre.shape))
-            offset += len(kind.index)
+            arm = np.full((most, *centre.shape), np.nan)
+            for k, hydrogen in enumerate(h for donor, h in _donors(kind.molecule) if donor == site):
+                arm[k] = rotation @ (body[hydrogen] - body[site])
+            arms.append(arm)
     at, who = np.concatenate(heavy), np.concatenate(owner)
-    givers, arms = np.concatenate(giver), np.concatenate(arm)
     pairs, gaps = near_pairs(at, frames.cell[frame] if frames.has_box else None, distance)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     way = np.concatenate([gaps, -gaps])  # from the first to the second
     different = who[both[:, 0]] != who[both[:, 1]]
     both, way = both[different], way[different]
-    order = np.argsort(givers, kind="stable")
-    begin, end = (np.searchsorted(givers[order], np.arange(len(at)), side=side) for side in ("left", "right"))
     counts = np.zeros(len(frames.system.model.species))
-    for k in range(int((end - begin).max())):
-        here = begin[both[:, 0]] + k < end[both[:, 0]]
-        pair, gap = both[here], way[here]
-        to = arms[order[begin[pair[:, 0]] + k]]
-        cosine = np.einsum("pi,pi->p", to, gap) / np.linalg.norm(to, axis=1) / np.linalg.norm(gap, axis=1)
+    for arm in np.concatenate(arms, axis=1):
+        to = arm[both[:, 0]]
+        cosine = np.einsum("pi,pi->p", to, way) / np.linalg.norm(to, axis=1) / np.linalg.norm(way, axis=1)
         bonded = cosine > np.cos(np.radians(angle))
-        np.add.at(counts, who[pair[bonded]].ravel(), 1.0)
+        np.add.at(counts, who[both[bonded]].ravel(), 1.0)
     return counts

@@ -99,7 +99,9 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         )
         return np.array([whole, second_half - first_half]) / 6
 
-    found = AnalysisResult("diffusion", "diffusion coefficients", curves=[_so_far(frames, interval, lags)])
+    later = interval * np.arange(1, lags)
+    curve = Curve("diffusion", ("Time (ps)", later), "MSD/6t (1e-9 m²/s)", {})  # it tends to D
+    found = AnalysisResult("diffusion", "diffusion coefficients", curves=[curve])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = None  # of a cubic box
     distance = frames.system.smallest_diameter  # over which a molecule has to move to change its surroundings
@@ -115,6 +117,8 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         except OutputError as error:
             eta = eta._replace(note=str(error))
     for kind in frames.moving:
+        so_far = lambda part, group: _displacements(part, group, lags)[1:] / (6 * NM2_PER_S * later)  # noqa: E731
+        curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *with_group_error(frames, kind, so_far))
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(frames, kind, slopes)).tolist()
         if D <= 0 or abs(bend) > BEND * D + 2 * np.nan_to_num(doubt):
@@ -143,17 +147,6 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
     if edge is None and frames.has_box:
         found.notes.append("no correction for the size of the box: the one of Yeh and Hummer is for cubic boxes")
     return found
-
-
-def _so_far(frames: RigidFrames, interval: float, lags: int) -> Curve:
-    """MSD/6t of each species, which tends to D."""
-    time = interval * np.arange(1, lags)
-    curve = Curve("diffusion", ("Time (ps)", time), "MSD/6t (1e-9 m²/s)", {})
-    size = 6 * NM2_PER_S * time
-    for kind in frames.moving:
-        found = with_group_error(frames, kind, lambda part, group: _displacements(part, group, lags)[1:] / size)
-        curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *found)
-    return curve
 
 
 SEGMENTS, SHORTEST = 10, 2.0  # number of segments of the tensor, and the least length of each, ps

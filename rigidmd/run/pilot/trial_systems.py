@@ -23,7 +23,7 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.run.pilot.choice import choose
-from rigidmd.run.pilot.shadow import sums_of_square_frequencies
+from rigidmd.run.pilot.sampling import sums_of_square_frequencies
 from rigidmd.run.pilot.trials import Method, TrialSystem
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SAMPLES

@@ -14,7 +14,7 @@ from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, ne
 from rigidmd.io.write import Column, Table
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.pilot.trial_systems import COMPARATORS, SPAN_PS, body_trial_system, molecular_trial_system
-from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial, TrialSystem, measure, plan
+from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
@@ -67,7 +67,14 @@ def measure_accuracy(
         evaluations = scene.run.row.force_evaluations if scene.run.has_scheme else 1
         base = RADIANS / speed if speed else AT_REST * scene.run.timestep_s / evaluations
     else:
-        trial_system, base = _of_molecules(scene, span)
+        last = scene.stages[-1]
+        if last.is_minimisation:
+            what = "the last stage is a minimisation: accuracy needs another stage at the end"
+            raise SceneError(scene.source, [what])
+        simulation, state = start_of_last_stage(scene)
+        trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
+        trial_system.rounding = single_precision_errors(simulation.system, state)
+        base = last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
     if refused := [name for name in integrators if name not in trial_system.methods]:
         reasons = [f"{name} does not suit this scene: {trial_system.refused[name]}" for name in refused]
         raise SceneError(scene.source, reasons)
@@ -96,17 +103,6 @@ def _method_name(name: str, scene: MolecularScene | BodyScene) -> str:
         form = form or scene.run.formulation
         return solver if form in (None, "matrix") else f"{solver}_{form}"
     return name
-
-
-def _of_molecules(scene: MolecularScene, span: float | None) -> tuple[TrialSystem, float]:
-    """The system, and the scene's time step per force evaluation (fs)."""
-    last = scene.stages[-1]
-    if last.is_minimisation:
-        raise SceneError(scene.source, ["the last stage is a minimisation: accuracy needs another stage at the end"])
-    simulation, state = start_of_last_stage(scene)
-    trial_system = molecular_trial_system(simulation.system, state, last.rotor, span or SPAN_PS)
-    trial_system.rounding = single_precision_errors(simulation.system, state)
-    return trial_system, last.timestep_fs / (last.row.force_evaluations if last.has_scheme else 1)
 
 
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")

@@ -38,6 +38,7 @@ class AveragedQuantity(NamedTuple):
     bias_size: float = 1.0  # of one such unit, in `unit`
     only: str = ""  # the integrator that has it, where not all do
     is_main: bool = True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
+    of: str = "its value"  # name of the scale
 
 
 @dataclass
@@ -193,7 +194,8 @@ def measure_averages(
     count = len(simulation.system.model.species)
     thermal = BOLTZMANN * stage.temperatures[0]
     unit = thermal * freedom.total / count / KJ_PER_MOL
-    quantities = [AveragedQuantity("U", "kJ/mol", unit, bias_unit="kT per degree of freedom", bias_size=unit)]
+    of_u = "kT per degree of freedom"
+    quantities = [AveragedQuantity("U", "kJ/mol", unit, bias_unit=of_u, bias_size=unit, of=of_u)]
     exact = stage.temperatures[0]
     for name, n in (("T_trans", freedom.translation), ("T_rot", freedom.rotation)):
         if n:
@@ -202,7 +204,7 @@ def measure_averages(
     if stage.ensemble == "npt":
         quantities.append(AveragedQuantity("density", "g/cm³", nan))
     elif state.volume < np.inf:
-        quantities.append(AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR))
+        quantities.append(AveragedQuantity("pressure", "bar", count * thermal / state.volume / BAR, of="N kT/V"))
     runs = [run for _, run in plan]
     for column in COLUMNS.values():  # where it varies
         if any(run.averages.get(column.header, (0.0, 0.0))[1] > 0 for run in runs):

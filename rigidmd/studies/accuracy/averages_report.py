@@ -16,13 +16,6 @@ def _bias_unit(quantity: AveragedQuantity) -> str:
     return quantity.bias_unit or quantity.unit
 
 
-def describe_scale(quantity: AveragedQuantity) -> str:
-    """The scale of which `BIAS_LIMIT` is a fraction."""
-    if quantity.name == "U":
-        return "kT per degree of freedom"
-    return "N kT/V" if quantity.name == "pressure" else "its value"
-
-
 def full_table(found: Averages) -> Table:
     """Means and biases of all runs, with their errors."""
     columns = [
@@ -84,7 +77,7 @@ def _describe_limits(found: Averages) -> list[str]:
             for method in methods_of(found)
             if (at := found.step_at_limit(method, quantity))
         ]
-        scale = f"{BIAS_LIMIT:.0%} of {describe_scale(quantity)}"
+        scale = f"{BIAS_LIMIT:.0%} of {quantity.of}"
         lines += [f"{quantity.name} is off by {scale} at: {'; '.join(steps)}"] if steps else []
     return lines
 
@@ -156,7 +149,7 @@ def averages_figure(found: Averages):
                 style = curve_style(methods.index(method))
                 handles[method] = axis.errorbar(steps, values, errors, ms=3.5, lw=1.1, capsize=2, **style)
         axis.set_title(f"{quantity.name}, {_bias_unit(quantity)}", loc="left", fontsize=9, color=INK, pad=17)
-        axis.annotate(f"band: {BIAS_LIMIT:.0%} of {describe_scale(quantity)}", (0, 1), (0, 4), xycoords="axes fraction",
+        axis.annotate(f"band: {BIAS_LIMIT:.0%} of {quantity.of}", (0, 1), (0, 4), xycoords="axes fraction",
                       textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
         open_axis(axis)
@@ -177,8 +170,8 @@ def averages_page(found: Averages, command: str) -> str:
 
     judged = [q for q in found.main if any(found.step_at_limit(method, q) for method in methods)]
     rows = [[colored[method], *(step(method, q) for q in judged)] for method in methods]
-    scales = dict.fromkeys(describe_scale(q) for q in judged)
-    of = [f"{scale} ({', '.join(q.name for q in judged if describe_scale(q) == scale)})" for scale in scales]
+    scales = dict.fromkeys(q.of for q in judged)
+    of = [f"{scale} ({', '.join(q.name for q in judged if q.of == scale)})" for scale in scales]
     about = f"{found.molecules} molecules, {found.freedom} degrees of freedom, {found.stage} at {found.temperature:g} K"
     note = f"{BIAS_LIMIT:.0%} is of {', '.join(of)}. Where none was seen, > gives the step up to which it is smaller"
     steps = table(["method", *(q.name for q in judged)], rows), items([note, *describe_references(found)])

@@ -251,8 +251,8 @@ def molecules_scene(
     return scene | {"output": output}
 
 
-def simulate(data: dict, state: State | None = None) -> Results:
-    simulation = Simulation(MolecularScene.from_dict(data))
+def simulate(data: dict, state: State | None = None, folder: str = ".") -> Results:
+    simulation = Simulation(MolecularScene.from_dict(data, folder))
     if state is not None:
         simulation.start_from(state)
     return simulation.run()
@@ -267,10 +267,11 @@ def energy_error(results: Results, scale: float = 0.0) -> float:
 
 @attempt
 def run_molecules(
-    data: dict, state: State | None = None, error: Callable[[Results], float] | None = None, scale: float = 0.0
-) -> Outcome:
+    data: dict, state: State | None = None, error: Callable[[Results], float] | None = None, scale: float = 0.0,
+    folder: str = ".",
+) -> Outcome:  # fmt: skip
     """The outcome of a run of molecules; its error is the energy error unless error(results) computes another."""
-    results = simulate(data, state)
+    results = simulate(data, state, folder)
     reported_error = energy_error(results, scale)
     return Outcome(reported_error if error is None else float(error(results)), reported_error)
 

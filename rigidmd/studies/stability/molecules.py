@@ -14,7 +14,6 @@ from rigidmd.assemble.build import build
 from rigidmd.assemble.describe import describe
 from rigidmd.core.state import State
 from rigidmd.core.state_file import write_state
-from rigidmd.run import Simulation
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.studies.stability.cases import (
     EXACT, REFUSED, REPORTED, RIGHT, SPLIT, CaseResult, Outcome, attempt, body_scene, energy_error, families,
@@ -107,9 +106,7 @@ def from_file(data: dict, state: State, velocities: bool = False) -> Outcome:
         path = Path(folder) / "start.npz"
         write_state(path, build(MolecularScene.from_dict(data | {"start": {"temperature_K": 0.0}})).saved(state))
         started = data | {"structure": {"file": path.name, "velocities": velocities}}
-        results = Simulation(Scene.from_dict(started | ({"start": {}} if velocities else {}), folder)).run()
-    reported_error = energy_error(results)
-    return Outcome(reported_error, reported_error)
+        return run_molecules(started | ({"start": {}} if velocities else {}), folder=folder)
 
 
 @register(8, error="energy error over kinetic energy", step="fs")

@@ -8,9 +8,11 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
+from rigidmd.run.results import Results
+from rigidmd.scene.validation import not_none
 from rigidmd.studies.stability.cases import (
-    QUICK, REFUSED, REPORTED, RIGHT, SPLIT, CaseResult, Outcome, attempt, longest_step, molecules_scene, register,
-    run_molecules, simulate,
+    QUICK, REFUSED, REPORTED, RIGHT, SPLIT, CaseResult, Outcome, longest_step, molecules_scene, register, run_molecules,
+    simulate,
 )  # fmt: skip
 from rigidmd.studies.stability.molecules import WATER_FORCES, bent
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
@@ -120,6 +122,13 @@ def equipartition(result: CaseResult, quick: bool) -> None:
     mixture = [kind | {"count": 12} for kind in (*species.values(), points)]
     settings = {} if quick else {name: [kind | {"count": 48}] for name, kind in species.items()}
     settings |= {"mixture": mixture}
+
+    def gap(results: Results) -> float:
+        late = len(results["time"]) // 5
+        series = (results[f"temperature_{motion}_unbiased"][late:] for motion in ("rotation", "translation"))
+        (rotation, its_error), (translation, error) = (map(not_none, mean_and_error(values)) for values in series)
+        return abs(rotation - translation) / hypot(its_error, error)
+
     for setting, molecules in settings.items():
         for step in (2.0, 8.0):
             steps = 4000 if quick else 10000
@@ -127,19 +136,7 @@ def equipartition(result: CaseResult, quick: bool) -> None:
             data = molecules_scene(
                 molecules, {"lengths_A": 16.0}, step, steps, SPLIT, 400.0, heat, {"cutoff_A": 8.0}, samples=steps // 10
             )
-
-            @attempt
-            def run(data=data) -> Outcome:
-                results = simulate(data)
-                half = len(results["time"]) // 5
-                rotation, its_error = mean_and_error(results["temperature_rotation_unbiased"][half:])
-                translation, error = mean_and_error(results["temperature_translation_unbiased"][half:])
-                if rotation is None or its_error is None or translation is None or error is None:
-                    raise ValueError("these molecules have no temperature of one of their motions")
-                gap = abs(rotation - translation) / hypot(its_error, error)
-                return Outcome(float(gap), float(np.abs(results["drift"]).max() / results["kinetic"][0]))
-
-            result.add(f"{setting}, {step:g} fs", run(), 4.0, SPLIT, step)
+            result.add(f"{setting}, {step:g} fs", run_molecules(data, error=gap), 4.0, SPLIT, step)
 
 
 @register(6, error="kinetic energy, standard errors from the canonical mean")

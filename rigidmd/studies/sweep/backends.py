@@ -288,7 +288,7 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
     from rigidmd.assemble.user_code.trust import trust
     from rigidmd.run import Every, Observer, Simulation
     from rigidmd.scene import BodyScene, Scene
-    from rigidmd.studies.sweep.plan import Digests
+    from rigidmd.studies.sweep.plan import digest_of
 
     class Begun(Observer):
         def begin(self, run: Simulation) -> None:
@@ -297,7 +297,7 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
     for path in task["trust"]:
         trust(path)
     scene = Scene.read(task["scene"], task["overrides"])
-    if Digests().of(scene) != task["sha256"]:
+    if digest_of(scene) != task["sha256"]:
         raise RigidMDError(f"{task['scene']} or a file that it reads has changed since the sweep began")
     sweep, folder = Path(task["folder"]), Path(task["folder"]) / task["name"]
     wait_for_folder(folder)

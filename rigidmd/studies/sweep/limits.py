@@ -51,7 +51,8 @@ class Limits(NamedTuple):
 
     @property
     def title(self) -> str:
-        powers = dict.fromkeys(f"dt{_power(limit.fit.order)} ({limit.method})" for limit in self.limits)
+        raised = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+        powers = dict.fromkeys(f"dt{str(limit.fit.order).translate(raised)} ({limit.method})" for limit in self.limits)
         return f"averages at a step of 0, from errors of order {', '.join(powers)} in {self.key}"
 
     def columns(self) -> list[Column]:
@@ -90,10 +91,6 @@ class Limits(NamedTuple):
             name = f"bias at {step:g} fs"
             found += with_error(name, lambda limit, step=step: digits(limit.bias(step)), f"{name} error")
         return Table(found, self.limits)
-
-
-def _power(order: int) -> str:
-    return str(order).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:

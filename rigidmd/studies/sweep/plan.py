@@ -8,8 +8,9 @@ import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from itertools import product
 from math import inf, prod
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 from rigidmd.assemble.scenes import resolve
 from rigidmd.core.toml import parse_whole_number, plain_values, shorten_repr
 from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
-from rigidmd.run.resume import NOT_COMPARED, differences, keys_of, plain, scene_digest
+from rigidmd.run.resume import NOT_COMPARED, differences, file_digest, input_digests, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.studies.sweep.folder import (
     SEED, Manifest, SweepPoint, clear_sweep, describe_values, is_sweep, point_name, read_manifest, short_keys,
@@ -170,7 +171,7 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
     fixed = {key: axis.values[0] for axis in axes if not axis.swept for key in axis.keys}
     short = short_keys(keys)
     every = settings(axes)
-    digest = Digests()
+    digest = cache(file_digest)  # each file is read once
     errors: dict[str, list[str]] = {}  # message -> descriptions of the points that have it
     checked: dict[str, RigidMDError | None] = {}  # values without the seed -> error; one replica is built
     manifest, scene = None, None
@@ -196,9 +197,9 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
             common = keys_of(plain(scene), (*NOT_COMPARED, *varied, *scene.inputs, *scene.embedded_files))
             # JSON has no infinity
             common = {key: str(value) if value in (inf, -inf) else value for key, value in common.items()}
-            inputs = {key: sha for key, sha in digest.inputs(scene).items() if key not in varied}
+            inputs = {key: sha for key, sha in input_digests(scene, digest).items() if key not in varied}
             manifest = Manifest(scene.name, str(Path(path).absolute()), keys, fixed, common, inputs)
-        manifest.points.append(SweepPoint(point_name(values, short), values, digest.of(scene)))
+        manifest.points.append(SweepPoint(point_name(values, short), values, digest_of(scene, digest)))
     if errors or manifest is None:
         described = []
         for error, points in errors.items():
@@ -208,26 +209,10 @@ def read_points(path: str | Path, axes: Sequence[Axis]) -> tuple[Manifest, bool]
     return manifest, isinstance(scene, BodyScene)
 
 
-class Digests:
-    """Digests of scenes, for which each file is read once."""
-
-    def __init__(self):
-        self._known: dict[Path, str] = {}
-
-    def inputs(self, scene: Scene) -> dict[str, str]:
-        """SHA-256 of each file that a scene reads, by its dotted key. Raises SceneError."""
-        try:
-            for path in scene.inputs.values():
-                if path not in self._known:
-                    self._known[path] = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise SceneError(scene.source, [f"{error.filename} cannot be read: {error.strerror}"]) from None
-        return {key: self._known[path] for key, path in scene.inputs.items()}
-
-    def of(self, scene: Scene) -> str:
-        """SHA-256 of a scene, as it was read, and of all files that it reads."""
-        text = json.dumps([scene_digest(scene), self.inputs(scene)], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+def digest_of(scene: Scene, file_digest: Callable[[Path], str] = file_digest) -> str:
+    """SHA-256 of a scene, as it was read, and of all files that it reads; see `input_digests`."""
+    text = json.dumps([scene_digest(scene), input_digests(scene, file_digest)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def order_axes(folder: Path, axes: list[Axis]) -> list[Axis]:

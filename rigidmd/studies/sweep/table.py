@@ -156,7 +156,7 @@ def summarise_run(record: Record) -> dict[str, Measured]:
             average, error = float(values[production][0]), 0.0
         found[IN_LOGS[name].header] = average, error
         if name == "potential":
-            n = len(record.molecules.model.species)
+            n = len(record.system.model.species)
             found[POTENTIAL] = average / n, None if error is None else error / n
     stages = (record.summary or {}).get("stages") or [{}]
     if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
