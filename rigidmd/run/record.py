@@ -53,6 +53,13 @@ class Record:
         return self.columns["time"]
 
     @property
+    def log(self) -> samples.Samples:
+        """The samples of a run of molecules; NaN in columns that log.csv does not have."""
+        names, unknown = self.system.more_columns, np.full(len(self.time), np.nan)
+        table = np.column_stack([self.columns.get(name, unknown) for name in (*samples.NUMBERS, *names)])
+        return samples.Samples([stage.label for stage in self.system.scene.stages], names, table.astype(float))
+
+    @property
     def moving(self) -> np.ndarray:
         """Which samples (t,) are not of minimisations, in which no time passes."""
         if isinstance(self.scene, BodyScene):
@@ -102,7 +109,7 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
     headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
-    if lacking := [name for name in ("time", "stage_name") if name not in headers]:
+    if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
         header = samples.COLUMNS[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
     found = {

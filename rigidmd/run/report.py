@@ -114,7 +114,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
         rows.append(("volume", f"{mean} nm³, the mean of the stage before, at whose end it was {end:.4g} nm³"))
     if stage["temperature_K"] is not None:
         value = _with_error(stage["temperature_K"], stage["temperature_error_K"], 2, "K")
-        rows.append(("temperature", value + set_point(stage["set_temperature_K"], "K", ", set point ")))
+        rows.append(("temperature", value + _set_point(stage["set_temperature_K"], "K")))
         if stage["temperature_rotation_K"] is not None:
             rows.append(("", _temperatures(stage, "")))
         if parts := _temperatures(stage, "_unbiased"):
@@ -128,7 +128,7 @@ def stage_rows(stage: dict) -> list[tuple[str, str]]:
     rows.append(("potential", _with_error(stage["potential_kJ_mol_per_molecule"], error, 3, "kJ/mol per molecule")))
     if stage["pressure_bar"] is not None:
         value = _with_error(stage["pressure_bar"], stage["pressure_error_bar"], 0, "bar")
-        rows.append(("pressure", value + set_point(stage["set_pressure_bar"], "bar", ", set point ")))
+        rows.append(("pressure", value + _set_point(stage["set_pressure_bar"], "bar")))
     if stage.get("density_g_cm3") is not None:
         rows.append(("density", _with_error(stage["density_g_cm3"], stage["density_error_g_cm3"], 4, "g/cm³")))
         edges = (f"{edge} {_with_error(stage[f'{edge}_A'], stage[f'{edge}_error_A'], 3)}" for edge in "abc")
@@ -163,12 +163,12 @@ def _with_error(value: float, error: float | None, places: int, unit: str = "") 
     return f"{text} {unit}".rstrip() + (f" ({NO_ERROR})" if error is None and unit else "")
 
 
-def set_point(given: float | Sequence[float] | None, unit: str, before: str = "") -> str:
-    """The set point of a thermostat or barostat behind a text, two values if it changes; empty without one."""
+def _set_point(given: float | Sequence[float] | None, unit: str) -> str:
+    """The set point of a thermostat or barostat, two values if it changes; empty without one."""
     if given is None:
         return ""
     values = given if isinstance(given, Sequence) else [given]
-    return f"{before}{(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
+    return f", set point {(' to ' if len(values) == 2 else ', ').join(f'{value:g}' for value in values)} {unit}"
 
 
 def _temperatures(stage: dict, kind: str) -> str:

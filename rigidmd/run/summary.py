@@ -78,7 +78,7 @@ def summarise(
         if k in minima:
             values = _minimised(system, samples, k, computing[k], minima[k])
         else:
-            values = _stage(system, samples, k, computing[k], record.moves.get(k, (0, 0)))
+            values = stage_summary(system, samples, k, computing[k], record.moves.get(k, (0, 0)))
         stable = record.stable[k] / FEMTOSECOND if k in record.stable else None
         choice = _choice(system, samples.of_stage(k), k, record.choices.get(k))
         stages.append(values | {"choice": choice, "stable_timestep_fs": stable})
@@ -232,7 +232,7 @@ def _drift_verdict(drift: float, error: float, limit: float) -> str | None:
     return f"significant, {count:.1f} standard errors, {'but small' if abs(drift) <= limit else 'and large'}"
 
 
-def _stage(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
+def stage_summary(system: System, samples: Samples, k: int, computing: float, moves: tuple[int, int]) -> dict:
     """Values of one stage: means over its equilibrated part, and its drift since the last sample before it."""
     of_stage, before = samples.of_stage(k), samples.of_stage(k - 1)
     first = before.row(-1) if len(before) else of_stage.row(0)

@@ -145,8 +145,12 @@ def _short_run(system: System, state: State, other: ExternalEngine) -> list[Comp
         ends, step_error = [end for end, _ in found], sum(error for _, error in found)
     difference = float(np.abs(ends[0] - ends[1]).max())
     moves = [float(np.abs(end - system.site_positions(state)).max()) for end in ends]
+    worst = 0.0  # displacement (Å) of a site by an error of a force, per u Å/ps² and ps²/2
     tolerance = TOLERANCE * max(1.0, moves[0]) + step_error + GROWTH * other.length_tolerance * moves[0]
-    tolerance += _ewald_tolerance(system, span)
+    for m in system.species:  # and what errors of the Ewald sums of both engines explain
+        least = m.inertia[m.inertia > 0].min(initial=np.inf)
+        worst = max(worst, np.sqrt(len(m.masses)) * (1 / m.mass + m.radius**2 / least))
+    tolerance += float(ERRORS * (system.force_error or 0.0) * worst * span**2 / 2)
     return [Comparison("largest move of a site", "Å", moves[0], moves[1], difference, tolerance)]
 
 
@@ -169,12 +173,3 @@ def _extrapolated(system: System, engine: Engine, state: State) -> tuple[np.ndar
         new = [b + (b - a) / (4**order - 1) for a, b in pairwise(table)]
         change, table = float(np.abs(new[-1] - table[-1]).max()), new
     return table[0], change
-
-
-def _ewald_tolerance(system: System, span: float) -> float:
-    """The difference of positions (Å) after a span (ps) that errors of the Ewald sums of both engines explain."""
-    error, worst = system.force_error or 0.0, 0.0
-    for m in system.species:
-        least = m.inertia[m.inertia > 0].min(initial=np.inf)
-        worst = max(worst, np.sqrt(len(m.masses)) * (1 / m.mass + m.radius**2 / least))
-    return float(ERRORS * error * worst * span**2 / 2)

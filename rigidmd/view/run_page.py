@@ -17,17 +17,17 @@ from rigidmd.analysis.files import curve_figure, read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples
-from rigidmd.core.statistics import format_signed, format_with_error, mean_and_error
-from rigidmd.engines.samples import BODY, describe_equilibrated, equilibrated_from
+from rigidmd.core.statistics import format_with_error
+from rigidmd.engines.samples import BODY
 from rigidmd.errors import InputError
 from rigidmd.figures.style import new_figure, save_figure
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run import Simulation
 from rigidmd.run.record import Record, read_record
-from rigidmd.run.report import body_rows, set_point
+from rigidmd.run.report import body_rows, stage_rows, stage_title
 from rigidmd.run.resume import MADE_WITH
-from rigidmd.run.summary import motion_figures
+from rigidmd.run.summary import motion_figures, stage_summary
 from rigidmd.scene import Scene
 from rigidmd.view import plots
 from rigidmd.view.body_animation import BodyAnimation
@@ -35,12 +35,6 @@ from rigidmd.view.molecule_animation import MoleculeAnimation
 from rigidmd.view.page import BAD, DOUBTFUL, GOOD, Raw, code, figure, items, notes, page, read_asset, section, table
 
 REPORT = "report.html"
-#: Columns of the table of means: name in the log, title; per molecule or not.
-MEANS = (
-    ("temperature", "T (K)", False), ("temperature_translation", "T_trans (K)", False),
-    ("temperature_rotation", "T_rot (K)", False), ("potential", "U (kJ/mol per molecule)", True),
-    ("pressure_bar", "P (bar)", False), ("density", "density (g/cm³)", False),
-)  # fmt: skip
 #: Files of a run: name -> contents.
 ABOUT = {
     "scene.toml": "the scene with all defaults: it repeats the run to the bit",
@@ -72,7 +66,7 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     if record.is_body:
         yield section("Results", _body_table(record))
     else:
-        yield section("Means of each stage", _means(record), _drifts(record))
+        yield section("Means of each stage", *_stages(record))
     if not animation:
         yield section("Plots", plots.plots_part(record))
     yield section("Analyses", *_analyses(record))
@@ -86,47 +80,16 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
     yield section("How to repeat it", *_repeat(record))
 
 
-def _means(record: Record) -> str:
-    n, seen = len(record.system.model.species), record.columns
-    shown = [entry for entry in MEANS if entry[0] in seen and np.isfinite(seen[entry[0]]).any()]
-    rows = []
-    for k in np.unique(seen["stage"][record.moving]):
-        of_stage = np.flatnonzero(seen["stage"] == k)
-        time = seen["time"][of_stage]
-        begin = float(seen["time"][max(0, of_stage[0] - 1)])
-        values, stage = {name: column[of_stage] for name, column in seen.items()}, record.system.scene.stages[k]
-        start, given = equilibrated_from(values, stage), [(stage.temperature_K, "K"), (stage.pressure_bar, "bar")]
-        set_points = "; ".join(filter(None, (set_point(value, unit) for value, unit in given)))
-        cells = [stage.label, describe_equilibrated(values, stage, begin), len(time) - start, set_points]
-        for column, _, per_molecule in shown:
-            values = seen[column][of_stage[start:]] / (n if per_molecule else 1)
-            if np.ptp(values) <= 1e-9 * np.abs(values).max():
-                cells.append(f"{values[0]:.6g}")
-                continue
-            value, error = mean_and_error(values)
-            cells.append("" if value is None else format_with_error(value, error))
-        rows.append(cells)
-    text = "Means ± one standard error over the equilibrated part of a stage, from log.csv; few samples have no error."
-    titles = ["stage", "means over", "samples", "set point", *(title for _, title, _ in shown)]
-    return f'{table(titles, rows)}<p class="faint">{text}</p>'
-
-
-def _drifts(record: Record) -> str:
-    """Drift of the conserved energy and speed, from the summary of a run that has ended."""
-    rows = []
-    for stage in (record.summary or {}).get("stages", ()):
-        cells = [stage["name"], stage.get("integrator"), _number(stage.get("timestep_fs"))]
-        for value in ("drift_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom"):
-            error = value.replace("drift_", "drift_error_")
-            known = stage.get(value) is not None and stage.get(error) is not None
-            cells.append(format_signed(stage[value], stage[error]) if known else "")
-        cells.append(stage.get("drift_verdict") or "")
-        cells += [_number(stage.get("energy_rms_kJ_mol_per_molecule")), _number(stage.get("ns_per_day"))]
-        rows.append(cells)
-    titles = ["stage", "integrator", "step (fs)", "drift (kJ/mol/ns per molecule)",
-              "drift (kT/ns per degree of freedom)", "verdict",
-              "energy noise (kJ/mol per molecule)", "ns/day"]  # fmt: skip
-    return table(titles, rows)
+def _stages(record: Record) -> Iterator[str]:
+    """Means and drifts of the stages, as the summary has them, from log.csv, which a run that has not ended has too."""
+    system, samples, known = record.system, record.log, (record.summary or {}).get("stages", ())
+    for place, k in enumerate(np.unique(samples["stage"]).tolist()):
+        if not system.scene.stages[k].is_minimisation:
+            ended = known[place] if place < len(known) else {}
+            moves = ended.get("moves_tried", 0), ended.get("moves_accepted", 0)
+            stage = stage_summary(system, samples, k, ended.get("computing_s", 0.0), moves)
+            yield f"<p>{html.escape(stage_title(stage))}</p>"
+            yield table([], stage_rows(stage | {"choice": ended.get("choice")}), words=True)
 
 
 def _analyses(record: Record) -> Iterator[str]:
@@ -151,10 +114,6 @@ def _analyses(record: Record) -> Iterator[str]:
     yield table(["", "value", "unit", "correlation time (ps)", ""], rows, words=True)
     yield f'<div class="plots">{"".join(figures)}</div>' if figures else ""
     yield "<p>Skipped:</p>" + items(left_out) if left_out else ""
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 def _body_table(record: Record) -> str:

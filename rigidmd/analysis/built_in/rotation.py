@@ -125,8 +125,6 @@ def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags
         return [Value(name, "1/ps", None, None, None, note) for name in names]
     first = max(1, lags // 5)
     time = interval * np.arange(first, lags)
-    if len(time) < 2:
-        return []
 
     def slopes(part: RigidFrames, group: Kind) -> np.ndarray:
         rotations = _rotations(part, group)

@@ -15,8 +15,8 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import error_of_step, precision_for
 from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
-from rigidmd.engines.body_motion import Motion, Snapshot, motion
-from rigidmd.engines.body_system import BodySystem, Pose
+from rigidmd.engines.body_motion import Snapshot, motion
+from rigidmd.engines.body_system import Pose
 from rigidmd.engines.observables import observe
 from rigidmd.engines.ode.rates import SMALLEST_SINE
 from rigidmd.engines.protocol import Engine
@@ -135,17 +135,20 @@ def body_trial_system(
         build_body(scene, applied)  # raises the error
     system = fits["velocity_verlet"]
     whole = min([span or run.duration_s, *system.breaks()])
-    seen = _coarse_motion(system, whole)
+    engine, snapshots = system.engine(), [Snapshot(0.0, system.state)]
+    state = engine.begin(system.state, system.method)
+    for step in range(0, COARSE_STEPS, COARSE_STEPS // COARSE_SAMPLES):
+        engine.advance(state, system.method, whole / COARSE_STEPS, step + COARSE_STEPS // COARSE_SAMPLES)
+        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
+    seen = motion(system, snapshots)
     kinetic = float(np.abs(seen["kinetic"]).max()) or 1.0
 
     def energy(engine, state) -> float:
         now = motion(system, [Snapshot(float(state.time[0]), state)])
         return float(now["energy"][0] - now["work"][0])
 
-    start = Snapshot(0.0, system.state)
-
     def conserved_errors(state) -> dict[str, float]:
-        seen = motion(system, [start, Snapshot(float(state.time[0]), state)])
+        seen = motion(system, [snapshots[0], Snapshot(float(state.time[0]), state)])
         return {name: float(seen[f"{name}_error"][-1]) for name in seen.invariants if name != "energy"}
 
     methods = {}
@@ -171,16 +174,6 @@ def body_trial_system(
         spin = max(float(np.abs(seen[f"omega_body_{k}"]).max()) for k in (1, 2, 3))
         speed = max(spin, float(np.abs(carried).max() / inertia.max()))
     return trial_system, speed
-
-
-def _coarse_motion(system: BodySystem, whole: float) -> Motion:
-    engine = system.engine()
-    state = engine.begin(system.state, system.method)
-    snapshots, every = [Snapshot(0.0, state.copy())], COARSE_STEPS // COARSE_SAMPLES
-    for k in range(COARSE_SAMPLES):
-        engine.advance(state, system.method, whole / COARSE_STEPS, (k + 1) * every)
-        snapshots.append(Snapshot(float(state.time[0]), state.copy()))
-    return motion(system, snapshots)
 
 
 def choose_for_molecules(system: System, state: State, k: int) -> tuple[Stage, str]:

@@ -144,14 +144,11 @@ def table_text(found: IntegratorAccuracy) -> str:
 
 
 def recommendations(found: IntegratorAccuracy) -> list[str]:
-    """Sentences: the cheapest integrator for each accuracy, then the reference and the longest stable steps."""
-    return [*describe_cheapest(found), *remarks(found)]
-
-
-def remarks(found: IntegratorAccuracy) -> list[str]:
-    """Sentences on the reference, the longest stable steps, what failed or was left out, and the timings."""
+    """Sentences on the cheapest integrator for each accuracy, the reference, the longest stable steps, what failed or
+    was left out, and the timings."""
     s = found.trial_system
     lines = [
+        *describe_cheapest(found),
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
         f"reference: {s.reference} in {found.reference_steps} steps, error about {found.reference_error:.0e}",
     ]
@@ -315,21 +312,8 @@ def accuracy_figure(found: IntegratorAccuracy):
 
 def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     colored = chips(list(dict.fromkeys(t.integrator for t in found.trials)))
-    unit = found.trial_system.time_unit
-    rows = [
-        [c.error, colored[c.integrator], f"{c.at.step:.2g}" + (f" ({c.at.limit})" if c.at.limit else ""),
-         f"{c.at.seconds / found.trial_system.span:.2g}",
-         f"{c.common.seconds / c.at.seconds:.1f} (at {c.common.step:.2g})" if c.common else "",
-         ", ".join(f"{name} at {at.step:.2g}" for name, at in c.rivals)]
-        for c in cheapest(found)
-    ]  # fmt: skip
-    per = "ps" if unit == "fs" else "s"
-    titles = [
-        f"for, over {found.trial_system.span:g} {per}", "the cheapest is", f"at a step of ({unit})",
-        f"seconds per {per}", "times faster than velocity_verlet", "as fast within the spread of the timings",
-    ]  # fmt: skip
     parts = [
-        section("Recommendations", table(titles, rows), items(remarks(found))),
+        section("Recommendations", items(recommendations(found))),
         section("Error against run time", wide(accuracy_figure(found), "accuracy", "log error over log run time")),
         section("All trials", table(*trial_table(found).shown(), marked=colored)),
         section("How to repeat it", code(command)),

@@ -6,7 +6,7 @@ from pathlib import Path
 from rigidmd.core.statistics import format_signed
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.write import Column, Table, with_error, write_json
-from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, AverageRun, Averages
+from rigidmd.studies.accuracy.averages import BIAS_LIMIT, AveragedQuantity, Averages
 from rigidmd.view.page import chips, code, items, page, plain, section, table, wide, write_page
 
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
@@ -113,23 +113,22 @@ def to_json(found: Averages, command: str) -> dict:
                 "longest_step_in_fit_fs": fit.longest, "bias_limit": found.bias_limit(quantity),
                 "step_of_that_bias_fs": {name: {"step": step, "seen": seen} for name, (step, seen) in steps.items()},
             }  # fmt: skip
+    runs = []
+    for run in found.runs:
+        averages = {}
+        for quantity in found.quantities:
+            if (point := found.point(run, quantity)) and (bias := found.bias(run, quantity)):
+                numbers = (point.mean, point.error, *bias)
+                averages[quantity.name] = dict(zip(("mean", "error", "bias", "bias_error"), numbers, strict=True))
+        runs.append({
+            "integrator": run.integrator, "thermostat": run.thermostat, "timestep_fs": run.timestep,
+            "forces_per_ps": run.forces_per_ps, "seconds_per_ns": run.seconds_per_ns, "averages": averages,
+            "failure": run.failure or None,
+        })  # fmt: skip
     return {
         "command": command, "scene": found.name, "stage": found.stage, "temperature_K": found.temperature,
         "molecules": found.molecules, "degrees_of_freedom": found.freedom, "sampled_ps": found.sampled,
-        "quantities": quantities, "runs": [_run_to_json(found, run) for run in found.runs],
-    }  # fmt: skip
-
-
-def _run_to_json(found: Averages, run: AverageRun) -> dict:
-    averages = {}
-    for quantity in found.quantities:
-        if (point := found.point(run, quantity)) and (bias := found.bias(run, quantity)):
-            numbers = (point.mean, point.error, *bias)
-            averages[quantity.name] = dict(zip(("mean", "error", "bias", "bias_error"), numbers, strict=True))
-    return {
-        "integrator": run.integrator, "thermostat": run.thermostat, "timestep_fs": run.timestep,
-        "forces_per_ps": run.forces_per_ps, "seconds_per_ns": run.seconds_per_ns, "averages": averages,
-        "failure": run.failure or None,
+        "quantities": quantities, "runs": runs,
     }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from itertools import product
+from itertools import chain, product
 from math import inf, prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,15 +47,13 @@ def parse_axis(text: str) -> Axis:
     if not equals or not all(keys):
         raise SceneError(OPTION, [f"{text!r} is not KEY=VALUE, for example stages.0.temperature_K=280,290,300"])
     pieces = _split_at_commas(listed, text)
-    if len(pieces) == 1 and (not pieces[0] or (span := _parse_range(pieces[0], text)) is None):
+    spans = [_parse_range(piece, text) for piece in pieces]
+    if spans == [None]:
         return Axis(keys, (parse_override(f"{keys[0]}={listed}")[1],), swept=False)
     if not all(pieces):
         raise SceneError(OPTION, [f"{shorten_repr(text)} has an empty value between its commas"])
-    values: list[Any] = []
-    for piece in pieces:
-        span = _parse_range(piece, text)
-        values += [parse_override(f"{keys[0]}={piece}")[1]] if span is None else span
-    return Axis(keys, tuple(values))
+    found = (span or [parse_override(f"{keys[0]}={piece}")[1]] for piece, span in zip(pieces, spans, strict=True))
+    return Axis(keys, tuple(chain.from_iterable(found)))
 
 
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
