@@ -56,12 +56,11 @@ def settings(changed: dict) -> Iterator[None]:
 
 
 @contextmanager
-def drawing(path: Path) -> Iterator[Path]:
-    """A temporary file to draw into, renamed when it is complete. An error of drawing becomes a warning, as results do
-    not depend on pictures. Raises OutputError if the file cannot be written."""
+def drawing(path: Path) -> Iterator[None]:
+    """Context in which an error of drawing becomes a warning, as results do not depend on pictures. The errors of this
+    package are raised."""
     try:
-        with atomic_file(path) as temporary:
-            yield temporary
+        yield
     except RigidMDError:
         raise
     except Exception as error:  # Matplotlib raises many types
@@ -83,13 +82,12 @@ def save_figure(figure, target, **options) -> None:
 
 
 def write_figure(path: Path, draw: Callable[[], Any], title: str = "") -> None:
-    """Draw a figure and write it under a title; see `drawing`."""
-    with drawing(path) as temporary:
+    """Draw a figure and write it under a title; see `drawing`. Raises OutputError."""
+    with drawing(path):
         figure = draw()
         if title:
             figure.suptitle(title, color=INK, x=0.01, ha="left", fontsize=11)
-        figure.lay_out(150)
-        save_figure(figure, temporary, dpi=150)
+        save_files(figure, path.with_suffix(""), [path.suffix[1:]])
 
 
 def save_files(figure: "Picture", stem: Path, suffixes: Sequence[str]) -> list[Path]:

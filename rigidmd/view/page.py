@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rigidmd.core.files import write_text
 from rigidmd.figures.style import COOL, FAINT, INK, WARM, curve_style, drawing, save_figure, settings
 
 #: Classes of a verdict: what is good, what to look at, what is wrong.
@@ -46,9 +47,9 @@ def page(title: str, parts: Iterable[str], head: str = "") -> str:
 
 
 def write_page(path: Path, make: Callable[[], str]) -> None:
-    """Write a page with figures; see `figures.style.drawing`."""
-    with drawing(path) as temporary:
-        temporary.write_text(make(), encoding="utf-8")
+    """Write a page with figures; see `figures.style.drawing`. Raises OutputError."""
+    with drawing(path):
+        write_text(path, make())
 
 
 def section(title: str, *parts: str, anchor: str = "") -> str:

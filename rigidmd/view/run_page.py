@@ -5,7 +5,6 @@ Chemiscope, whose JavaScript is in the page, draws the animation of molecules.
 
 import base64
 import html
-import io
 import json
 import shlex
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from rigidmd.core.shipped import Example, examples
 from rigidmd.core.statistics import format_with_error
 from rigidmd.engines.samples import BODY
 from rigidmd.errors import InputError
-from rigidmd.figures.style import new_figure, save_figure
+from rigidmd.figures.style import new_figure
 from rigidmd.io.folder import SCENE
 from rigidmd.io.formats import BY_EXTENSION
 from rigidmd.run import Simulation
@@ -227,8 +226,8 @@ INDEX = "index.html"
 SHOWN = (
     *(f"heavy_top_{k}" for k in range(1, 8)), "intermediate_axis", "sleeping_top", "gyrocompass", "dropped_stone",
 )  # fmt: skip
-#: Inches and dots per inch of a picture, and the fraction of the run that has passed in it.
-INCHES, DPI, RUN_FRACTION = 3.2, 100, 0.62
+#: Inches of a picture, and the fraction of the run that has passed in it.
+INCHES, RUN_FRACTION = 3.2, 0.62
 STYLE = """<style>.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr));gap:1rem}
 .cards a{color:inherit;text-decoration:none;border:1px solid var(--line);border-radius:8px;padding:.6rem;display:block}
 .cards img{width:100%;background:#fff;border-radius:4px}.cards b{display:block}</style>"""
@@ -256,12 +255,10 @@ def write_gallery(
         run = folder / "runs" / example.name
         Simulation(scene, run, force).run()
         target, _ = write_view(run, folder / f"{example.name}.html")
-        animation, stream = BodyAnimation(read_record(run)), io.BytesIO()
-        figure = new_figure(INCHES, INCHES, layout=None, dpi=DPI)
+        animation, figure = BodyAnimation(read_record(run)), new_figure(INCHES, INCHES, layout=None)
         begin, end = animation.time[[0, -1]]
         animation.draw(figure.add_axes((0, 0, 1, 1)), float(begin + RUN_FRACTION * (end - begin)))
-        save_figure(figure, stream, format="png", dpi=DPI)
-        picture = base64.b64encode(stream.getvalue()).decode()
+        picture = base64.b64encode(figure.png()[0]).decode()
         cards.append(
             f'<a href="{target.name}"><img alt="" src="data:image/png;base64,{picture}">'
             f"<b>{html.escape(example.name)}</b><span>{html.escape(example.about)}</span></a>"

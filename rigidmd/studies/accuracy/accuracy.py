@@ -4,7 +4,6 @@ table, recommendations, accuracy.csv, .png and a self-contained page."""
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, ne
 from rigidmd.io.write import Column, Table
 from rigidmd.run.force_errors import single_precision_errors
 from rigidmd.run.pilot.trial_systems import COMPARATORS, SPAN_PS, body_trial_system, molecular_trial_system
-from rigidmd.run.pilot.trials import IntegratorAccuracy, ReachedError, Trial, measure, plan
+from rigidmd.run.pilot.trials import IntegratorAccuracy, Trial, measure, plan
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean
 from rigidmd.studies.accuracy.averages import check_engine_is_rigidmd, start_of_last_stage
@@ -189,30 +188,21 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
 COMMON = "velocity_verlet"  # integrator to compare with
 
 
-class Cheapest(NamedTuple):
-    """The integrator that reaches an error, or each of several errors, in the least run time."""
-
-    error: str  # what error this is, with its unit
-    target: float  # the largest
-    integrator: str
-    at: ReachedError
-    common: ReachedError | None  # of `COMMON`; None if it is the cheapest or does not reach the target
-    rivals: tuple[tuple[str, ReachedError], ...]  # others, as fast within the spread of the timings
-
-
-def cheapest(found: IntegratorAccuracy) -> list[Cheapest]:
-    """The cheapest integrator for each error of the energy, and of Q or X; errors with the same one are joined."""
-    s = found.trial_system
+def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
+    """Sentences: the cheapest integrator for each error of the energy, and of Q or X, and the others that are as fast.
+    Errors with the same answer share a sentence."""
+    s, lines = found.trial_system, []
+    per, unit = "ps" if s.time_unit == "fs" else "s", s.time_unit
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
     kinds = {
         "energy_rms": ("an energy error", s.energy_unit),
         "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
     }
-    names, lines = list(dict.fromkeys(t.integrator for t in found.trials)), []
-    for error, (what, unit) in kinds.items():
+    for error, (what, of) in kinds.items():
         worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
-        same = None
+        answers: dict[str, list[float]] = {}  # -> the targets that have it
         for target in 10.0 ** np.arange(0, -15, -2):
+            names = dict.fromkeys(t.integrator for t in found.trials)
             reached = {name: at for name in names if (at := found.time_for(name, error, target))}
             blind = error == "trajectory_error" and target < 3 * found.reference_error
             if target > worst or len(reached) < 2 or blind:
@@ -220,30 +210,18 @@ def cheapest(found: IntegratorAccuracy) -> list[Cheapest]:
             best = min(reached, key=lambda name: reached[name].seconds)
             at, common = reached.pop(best), reached.get(COMMON)
             slow = at.seconds * (1 + at.spread / 2)
-            rivals = tuple((name, r) for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow)
-            described = f"{what} of {target:.0e} {unit}".rstrip()
-            line = Cheapest(described, float(target), best, at, common, rivals)
-            if same is not None and line[2:] == same[2:]:
-                described = f"{what} of {same.target:.0e} to {target:.0e} {unit}".rstrip()
-                line = line._replace(error=described, target=same.target)
-                lines.pop()
-            lines.append(line)
-            same = line
-    return lines
-
-
-def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
-    s, lines = found.trial_system, []
-    per, unit = "ps" if s.time_unit == "fs" else "s", s.time_unit
-    for c in cheapest(found):
-        limit = f" ({c.at.limit})" if c.at.limit else ""
-        line = f"for {c.error} over {s.span:g} {per} the cheapest is {c.integrator} at {c.at.step:.2g} {unit}{limit}"
-        if c.common and COMMON not in [name for name, _ in c.rivals]:
-            line += f": {c.common.seconds / c.at.seconds:.1f} times faster than {COMMON} at {c.common.step:.2g} {unit}"
-        if c.rivals:
-            rivals = ", ".join(f"{name} at {at.step:.2g} {unit}" for name, at in c.rivals)
-            line += f"; as fast within the spread of the timings: {rivals}"
-        lines.append(line)
+            rivals = {name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow}
+            answer = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}"
+            if common and COMMON not in rivals:
+                faster = f"{common.seconds / at.seconds:.1f} times faster"
+                answer += f": {faster} than {COMMON} at {common.step:.2g} {unit}"
+            if rivals:
+                steps = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
+                answer += f"; as fast within the spread of the timings: {steps}"
+            answers.setdefault(answer, []).append(target)
+        for answer, targets in answers.items():
+            span = " to ".join(f"{target:.0e}" for target in dict.fromkeys((targets[0], targets[-1])))
+            lines.append(f"for {f'{what} of {span} {of}'.rstrip()} over {s.span:g} {per} the cheapest is {answer}")
     if lines and s.time_unit == "fs":
         lines.append(
             f"energy errors grow over longer runs, by a random walk where forces are truncated: --span measures them "

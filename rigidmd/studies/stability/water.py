@@ -97,12 +97,9 @@ def warm(model: str, temperature: float, step: float) -> State:
 
 
 def frozen() -> State:
-    """Water at rest in a minimum of its energy: cooled, then stopped repeatedly."""
-    state = warm("spce", 10.0, 0.5)
-    for _ in range(200):
-        state.velocity[:] = 0.0
-        state.angular_momentum_body[:] = 0.0
-        state = simulate(water_scene("spce", 0.5, 20, SPLIT, 0.0), state).state
+    """Water at rest in a minimum of its energy."""
+    minimum = {"ensemble": "minimise"}
+    state = simulate(water_scene("spce", 0.5, 20) | {"stages": [minimum]}, liquid("spce")).state
     state.velocity[:] = 0.0
     state.angular_momentum_body[:] = 0.0
     return state

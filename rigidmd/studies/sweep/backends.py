@@ -270,7 +270,7 @@ def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: b
     began = clock.monotonic()
     ended: PointResult = {"state": "failed", "message": None, "sha256": None, "seconds": 0.0, "out_of_time": False}
     try:
-        _run(task, send, progress, ended)
+        ended["state"], ended["sha256"], ended["out_of_time"] = _run(task, send, progress)
     except RigidMDError as error:
         ended["message"] = str(error)
     except KeyboardInterrupt:
@@ -284,7 +284,8 @@ def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: b
     return ended
 
 
-def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> None:
+def _run(task: PointTask, send: Send, progress: bool) -> tuple[State, str | None, bool]:
+    """The state of a point after its run, the digest of its scene if it has finished, and whether its time was up."""
     from rigidmd.assemble.user_code.trust import trust
     from rigidmd.run import Every, Observer, Simulation
     from rigidmd.scene import BodyScene, Scene
@@ -303,8 +304,7 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
     wait_for_folder(folder)
     point = SweepPoint(task["name"], {}, task["sha256"], ran_sha256=task["ran_sha256"])
     if state_on_disk(sweep, point) == "finished":
-        ended["state"], ended["sha256"] = "finished", task["ran_sha256"]
-        return
+        return "finished", task["ran_sha256"], False
     walltime = None if task["ends_at"] is None else max(0.0, task["ends_at"] - clock.time())
     observers: list[Observer] = [Begun()]
     whole = scene.run.duration_s if isinstance(scene, BodyScene) else sum(stage.duration for stage in scene.stages)
@@ -317,9 +317,9 @@ def _run(task: PointTask, send: Send, progress: bool, ended: PointResult) -> Non
         warn=lambda sentence: send("warned", sentence), resume=resume, walltime=walltime,
     )  # fmt: skip
     results = simulation.run(progress=progress)
-    ended["state"] = "interrupted" if results.interrupted else "finished"
-    ended["sha256"] = None if results.interrupted else results.summary["scene_sha256"]
-    ended["out_of_time"] = results.out_of_time
+    if results.interrupted:
+        return "interrupted", None, results.out_of_time
+    return "finished", results.summary["scene_sha256"], False
 
 
 def wait_for_folder(folder: Path, timeout: float = LOCK_TIMEOUT) -> None:
