@@ -265,7 +265,7 @@ def noise_with_memory(rng, frames, shape, variance, time, interval):
 
 #: Inner module of rigidmd -> the names in it that tests use.
 HOMES = {
-    "run.schedule": "CheckpointSchedule",
+    "run.schedule": "CheckpointSchedule interruptible",
     "assemble.build": "barostat_of integrator_of_stage thermostat_of",
     "scene.species": "Box",
     "assemble.start": "close_pairs every_site",
@@ -393,7 +393,6 @@ HOMES = {
     "run.resume": "Arrays state_from",
     "run.body": "BodyRecord BodyRun",
     "run.molecular": "MolecularRecord MolecularRun",
-    "run.signals": "interruptible",
     "studies.accuracy.averages": ("AverageRun AveragedQuantity Averages measure_averages start_of_last_stage "),
     "studies.extrapolation": "MeanAtStep extrapolate means_of_runs",
     "studies.compare": "compare describe_run_comparison",

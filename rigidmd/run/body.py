@@ -31,8 +31,7 @@ from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import fastest_body_rate
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
-from rigidmd.run.schedule import Segment
-from rigidmd.run.signals import interruptible
+from rigidmd.run.schedule import Segment, interruptible
 from rigidmd.run.summary import summarise_body
 from rigidmd.scene import BodyScene
 from rigidmd.scene.validation import not_none

@@ -1,5 +1,6 @@
 """The loop of a run: it begins or resumes, jumps from one observation to the next, and ends with all files."""
 
+# isort: skip_file
 import contextlib
 import os
 import signal
@@ -27,8 +28,9 @@ from rigidmd.io.write import write_json
 from rigidmd.run import resume
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.results import Results
-from rigidmd.run.schedule import SEGMENT_SECONDS, CheckpointSchedule, ObservationSchedule
-from rigidmd.run.signals import interruptible, signal_handler, stop_signals
+from rigidmd.run.schedule import (
+    SEGMENT_SECONDS, CheckpointSchedule, ObservationSchedule, interruptible, signal_handler, stop_signals,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from rigidmd.run.simulation import Simulation

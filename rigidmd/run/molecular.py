@@ -37,8 +37,7 @@ from rigidmd.run.part import RunPart
 from rigidmd.run.pilot.stable_step import DIRECTIONS, SMALL_SYSTEM, stiffest_mode
 from rigidmd.run.report import summary_text
 from rigidmd.run.resume import Count, RunRecord, check_same_scene, plain, state_from
-from rigidmd.run.schedule import Segment
-from rigidmd.run.signals import interruptible
+from rigidmd.run.schedule import Segment, interruptible
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage

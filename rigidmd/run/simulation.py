@@ -24,8 +24,7 @@ from rigidmd.io.scene_file import write_scene
 from rigidmd.run.loop import RunLoop
 from rigidmd.run.observers import as_observer
 from rigidmd.run.results import Results
-from rigidmd.run.schedule import checked_walltime
-from rigidmd.run.signals import signal_handler, stop_signals
+from rigidmd.run.schedule import checked_walltime, signal_handler, stop_signals
 from rigidmd.scene import BodyScene, Scene
 
 if TYPE_CHECKING:

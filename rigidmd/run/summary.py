@@ -23,14 +23,6 @@ if TYPE_CHECKING:
 TEMPERATURES = {name: "K" for name in COLUMNS if name.startswith("temperature")}
 BOX = {"density": "g_cm3", "a": "A", "b": "A", "c": "A"}
 HYBRID = {"acceptance": "mean", "abs_dH_kT": "mean", "exp_minus_dH": "mean"}
-#: Keys of a stage that are None for a minimisation.
-MOTION_KEYS = (
-    "integrator", "timestep_fs", "steps_per_s", "ns_per_day", "means_over", "equilibrated_from_ps",
-    "set_temperature_K", "set_pressure_bar", *(f"{name}_{error}K" for name in TEMPERATURES for error in ("", "error_")),
-    "potential_error_kJ_mol_per_molecule", "pressure_error_bar", "drift_verdict", "drift_kJ_mol_ns_per_molecule",
-    "drift_error_kJ_mol_ns_per_molecule", "drift_kT_ns_per_degree_of_freedom",
-    "drift_error_kT_ns_per_degree_of_freedom", "drift_over_kinetic_std", "energy_rms_kJ_mol_per_molecule",
-)  # fmt: skip
 #: The second half of a stage has notes if it has enough samples, on effects larger than some standard errors. A drift
 #: is significant from there on: in random walks of the energy its errors are up to 1.5 times too small (`slope`).
 MIN_SAMPLES, STANDARD_ERRORS = 20, 4.0
@@ -282,10 +274,10 @@ def stage_summary(system: System, samples: Samples, k: int, computing: float, mo
 
 
 def _minimised(system: System, samples: Samples, k: int, computing: float, found: Minimum) -> dict:
-    """Values of a minimisation, at its end; None for MOTION_KEYS."""
+    """Values of a minimisation, at its end; None for those that only a stage of motion has."""
     stage, figures = system.scene.stages[k], minimum_figures(found, len(system.model.species))
     end = Samples(samples.stages, samples.user_terms, samples.of_stage(k).table()[-1:])
-    return dict.fromkeys(MOTION_KEYS) | {
+    return dict.fromkeys(stage_summary(system, samples, k, computing, (0, 0))) | {
         "name": stage.label, "ensemble": stage.ensemble, "steps": 0, "duration_ps": 0.0, "computing_s": computing,
         "potential_kJ_mol_per_molecule": figures["energy_after_kJ_mol_per_molecule"],
         "pressure_bar": figures["pressure_bar"], **(_means(end, BOX) if stage.changes_box else {}), "moves_tried": 0,

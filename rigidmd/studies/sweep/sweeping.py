@@ -20,8 +20,7 @@ from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder, is_empty
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
-from rigidmd.run.schedule import checked_walltime
-from rigidmd.run.signals import signal_handler
+from rigidmd.run.schedule import checked_walltime, signal_handler
 from rigidmd.scene import Scene
 from rigidmd.scene.base import default_name, read_tables
 from rigidmd.studies.sweep.backends import Cluster, PointResult, PointTask, Pool, Send, run_task
