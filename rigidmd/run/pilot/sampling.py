@@ -12,6 +12,7 @@ from rigidmd.assemble.time_step import stable_angle
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, State
 from rigidmd.dynamics.hybrid_monte_carlo import CHANCES, ENDED
+from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
@@ -39,11 +40,8 @@ MAX_STABLE_FRACTION = 0.5
 def sums_of_square_frequencies(system: System, engine: Engine, state: State, thermal: float) -> tuple[float, float]:
     """Sums of w² (1/ps²) over the degrees of freedom of translation and rotation, at kT = `thermal` (u Å²/ps²). By
     equipartition <F²/m> = kT sum w², likewise for torques. Exact in the mean over the canonical distribution."""
-    (force, torque), _ = engine.evaluate(state)
-    model = system.model
-    translation = float((force**2).sum(axis=1) @ model.inverse_mass[model.species])
-    rotation = float((torque**2 * model.inverse_inertia[model.species][: len(torque)]).sum())
-    return translation / thermal, rotation / thermal
+    sums = sums_of_state(system.model, state, engine.evaluate(state)[0])
+    return sums.force / thermal, sums.torque / thermal
 
 
 def bias_of_potential(integrator: str, rate: float, timestep: float) -> float:

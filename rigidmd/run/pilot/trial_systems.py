@@ -15,6 +15,7 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import error_of_step, precision_for
 from rigidmd.core.integrators import FORMULATIONS, SCHEMES, SOLVERS, Scheme, Solver
 from rigidmd.core.state import State
+from rigidmd.dynamics.observables import sums_of_state
 from rigidmd.engines.body_motion import Snapshot, motion
 from rigidmd.engines.body_system import Pose
 from rigidmd.engines.observables import observe
@@ -23,7 +24,6 @@ from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.run.pilot.choice import choose
-from rigidmd.run.pilot.sampling import sums_of_square_frequencies
 from rigidmd.run.pilot.trials import Method, TrialSystem
 from rigidmd.scene import BodyScene
 from rigidmd.scene.body import SAMPLES
@@ -46,13 +46,9 @@ COARSE_SAMPLES, COARSE_STEPS = 200, 20_000
 def natural_time(system: System, state: State) -> float | None:
     """Time (ps) of one radian of the faster of vibration and libration; None at rest. Its inverse squared is <F²/m> /
     <m v²>, the mean square frequency of harmonic motion; likewise for torques."""
-    model, momentum = system.model, state.angular_momentum_body
-    motions = (
-        float(model.mass[model.species] @ (state.velocity**2).sum(axis=1)),
-        float((momentum**2 * model.inverse_inertia[model.species][: len(momentum)]).sum()),
-    )
-    forces = sums_of_square_frequencies(system, system.engine(), state, 1.0)
-    fastest = max(force / motion if motion > 0 else 0.0 for force, motion in zip(forces, motions, strict=True))
+    sums = sums_of_state(system.model, state, system.engine().evaluate(state)[0])
+    pairs = (sums.force, sums.translation), (sums.torque, sums.rotation)
+    fastest = max(force / motion if motion > 0 else 0.0 for force, motion in pairs)
     return 1 / sqrt(fastest) if fastest > 0 else None
 
 
