@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.core.statistics import format_signed
-from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import Samples, moving
 from rigidmd.engines.system import System
@@ -18,15 +17,12 @@ if TYPE_CHECKING:
     from rigidmd.figures.picture import Picture
 
 
-def run_figures(
-    system: System | BodySystem, samples: Samples | Motion, summary: dict[str, Any]
-) -> "dict[str, Picture]":
+def run_figures(system: System | BodySystem, samples: Any, summary: dict[str, Any]) -> "dict[str, Picture]":
     """The figures of a run by the names of their files, if there are enough samples."""
     if isinstance(system, BodySystem):
-        return body_figures(system, samples) if isinstance(samples, Motion) else {}
-    if isinstance(samples, Samples) and moving(system.scene.stages, samples["stage"]).sum() > 1:
-        return {"energy": energy_figure(system, samples, summary)}
-    return {}
+        return body_figures(system, samples)
+    is_enough = moving(system.scene.stages, samples["stage"]).sum() > 1
+    return {"energy": energy_figure(system, samples, summary)} if is_enough else {}
 
 
 #: Mean width of a letter of a stage's name as a fraction of an axis of energy.png, and rows of names at most.

@@ -43,8 +43,6 @@ MIN_MOMENT = 1e-9
 
 #: `gradient_forces` or `site_forces`.
 Form = Literal["gradient", "sites"]
-#: Components of a stress in ASE: xx, yy, zz, yz, xz, xy.
-VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "ase.Atoms | list[ase.Atoms]":
@@ -130,6 +128,8 @@ def ase_results(
 
     atoms : positions (a, 3) where they are not those of rigid molecules, Å
     """
+    from ase.stress import full_3x3_to_voigt_6_stress
+
     velocity, momentum = np.zeros_like(state.velocity), np.zeros_like(state.angular_momentum_body)
     seen = observe(system, engine, state._replace(velocity=velocity, angular_momentum_body=momentum), energy_unit=EV)
     load, torque = seen.load, np.zeros_like(seen.load.force)
@@ -141,7 +141,7 @@ def ase_results(
         force = gradient_forces(system, state, load.force, torque, atoms)
     found = {"energy": seen.potential, "forces": force / EV}
     if np.isfinite(state.cell).all():
-        found["stress"] = np.array([-seen.pressure_tensor_bar[at] for at in VOIGT]) * (BAR / EV)
+        found["stress"] = full_3x3_to_voigt_6_stress(-seen.pressure_tensor_bar) * (BAR / EV)
     return found
 
 

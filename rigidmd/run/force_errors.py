@@ -208,8 +208,16 @@ def _moved(state: State, kind: str, m: int, along: np.ndarray, by: float) -> Sta
 def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Difference) -> str:
     """The error of the virial in a box; empty without one."""
     for i, j in COMPONENTS:
+
+        def strained(by: float, i=i, j=j) -> State:
+            """A copy of the state with centres of mass and cell strained, x_j += by x_i (lab)."""
+            found = state.copy()
+            for array in (found.position, found.cell):
+                array[:, j] += by * array[:, i]
+            return found
+
         given = float(virial[j, i])
-        found = difference(partial(_strained, state, i, j), STRAINS, given, size)
+        found = difference(strained, STRAINS, given, size)
         if found is not None:
             return (
                 f"the component {'xyz'[j]}{'xyz'[i]} of its molecular virial is {given / KJ_PER_MOL:.8g} kJ/mol, and "
@@ -218,11 +226,3 @@ def _check_virial(state: State, virial: np.ndarray, size: float, difference: _Di
                 "tied_to_places = True in its class"
             )
     return ""
-
-
-def _strained(state: State, i: int, j: int, by: float) -> State:
-    """A copy of a state with centres of mass and cell strained, x_j += by x_i (lab)."""
-    strained = state.copy()
-    for array in (strained.position, strained.cell):
-        array[:, j] += by * array[:, i]
-    return strained

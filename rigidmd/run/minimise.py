@@ -239,7 +239,7 @@ def minimise(
 
     stop : called before each iteration; the minimisation ends if it is true; advanced : called after each with 1
 
-    Raises SimulationError if the energy has no lower bound or is not a finite number.
+    Raises SimulationError if the energy has no lower bound or is not a finite number, or the box grows without bound.
     """
     enthalpy = Enthalpy(system, stage, state)
     point = start = enthalpy.at(state.copy())
@@ -272,7 +272,13 @@ def minimise(
         else:
             point, iterations = found, iterations + 1
             advanced(1)
-            _check_volume(system, start, point)
+            largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
+            if point.state.volume < inf and largest and grown > largest:
+                raise SimulationError(
+                    f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {largest:g}): the enthalpy "
+                    "has no minimum at a finite volume. Likely cause: at this pressure nothing holds the molecules "
+                    "together. Try a higher pressure_bar"
+                )
             if iterations % SEARCH_INTERVAL == 0:
                 _check_charges(system, point)
     if not converged:
@@ -353,17 +359,6 @@ class _Descent:
                 return move, other
             length *= min(0.5, max(0.1, -slope * length / (2 * (gain - slope * length)))) if isfinite(gain) else 0.1
         return None
-
-
-def _check_volume(system: System, start: EnthalpyPoint, point: EnthalpyPoint) -> None:
-    """Raise SimulationError if the box grows without bound."""
-    largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
-    if point.state.volume < inf and largest and grown > largest:
-        raise SimulationError(
-            f"the box has grown to {grown:.3g} volumes of the start (watch.volume = {largest:g}): the enthalpy has no "
-            "minimum at a finite volume. Likely cause: at this pressure nothing holds the molecules together. Try a "
-            "higher pressure_bar"
-        )
 
 
 def _check_charges(system: System, point: EnthalpyPoint) -> None:

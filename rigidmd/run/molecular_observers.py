@@ -159,11 +159,8 @@ class StepWatch(Observer):
     def __init__(self, run: "Simulation", check: checks.StepCheck):
         self._run, self._check = run, check
         interval, stages = run.scene.output.log_interval_ps, run.scene.stages
-        of_samples = [
-            inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND)
-            for stage in stages
-            if not stage.is_minimisation
-        ]
+        moving = [stage for stage in stages if not stage.is_minimisation]
+        of_samples = [inf if stage.is_auto else interval / (stage.timestep_fs * FEMTOSECOND) for stage in moving]
         every = checks.check_interval(run.system)
         self.steps = every if max(of_samples, default=0.0) > every else None  # samples come at least as often
 

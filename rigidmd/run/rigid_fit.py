@@ -23,7 +23,8 @@ class RigidFit:
     """Fits the molecules of a system, with the axes of `rigidmd models NAME`, to frames of sites."""
 
     def __init__(self, system: System):
-        self._kinds, self._n, self._rotates = kinds_of(system), len(system.model.species), len(system.state.rotation) > 0
+        self._kinds, self._n = kinds_of(system), len(system.model.species)
+        self._rotates = len(system.state.rotation) > 0
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
         """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.

@@ -7,9 +7,9 @@ import numpy as np
 
 from rigidmd.assemble.body import inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
+from rigidmd.figures.style import camera
 from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.mechanics.inertia import SOLIDS
-from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
 #: Corners of a circle; least thickness of a body, as a fraction of its reach.
@@ -83,8 +83,7 @@ def _top_mesh(
     axis, right = axes[:, symmetric], axes[:, symmetric - 2]
     is_ball = bool(np.ptp(moments) <= EQUAL_MOMENTS * moments.max())
     if is_ball and far:
-        axis = centre / far
-        right = unit_vector(np.cross(np.eye(3)[np.abs(axis).argmin()], axis))
+        right, _, axis = camera(centre, np.eye(3)[np.abs(centre).argmin()])
     elif axis @ centre < 0:
         axis = -axis
     if is_ball:
@@ -118,8 +117,8 @@ def _points_mesh(positions: np.ndarray, masses: np.ndarray) -> Mesh:
         parts.append(BALL._replace(vertices=BALL.vertices * max(radius, 0.02 * size) + position))
     for i, j in shortest_links(positions):
         along = positions[j] - positions[i]
-        right = unit_vector(np.cross(along, np.eye(3)[np.abs(along).argmin()]))
-        frame = np.stack([0.02 * size * right, 0.02 * size * unit_vector(np.cross(along, right)), along])
+        frame = camera(along, np.eye(3)[np.abs(along).argmin()])
+        frame *= [[0.02 * size], [0.02 * size], [np.linalg.norm(along)]]
         vertices = CYLINDER.vertices @ frame + (positions[i] + positions[j]) / 2
         parts.append(CYLINDER._replace(vertices=vertices, painted=[False] * len(CYLINDER.faces)))
     faces, painted, start = [], [], 0

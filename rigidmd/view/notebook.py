@@ -201,8 +201,9 @@ class AnimationPage:
         return path
 
 
-def show_animation(results: Results) -> "StructureWidget | AnimationPage":
-    """The animation of results. Raises ImportError without chemiscope, ValueError without a trajectory."""
+def show(results: Results) -> "StructureWidget | AnimationPage":
+    """The animation of a run in a notebook: molecules by chemiscope, a body on a small page. Raises ImportError without
+    chemiscope, ValueError without a trajectory."""
     if isinstance(results.system, BodySystem):
         record = record_of(results.system, results.samples, results.summary)
         return AnimationPage(page(record.scene.name, animation_parts(record, BodyAnimation(record)), FILM_STYLE))

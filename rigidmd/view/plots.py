@@ -4,7 +4,7 @@ import time as clock
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from rigidmd.figures.style import COLORS, FAINT, INK, new_figure, open_axis, sho
 from rigidmd.io.progress import DisplayArea, in_notebook
 from rigidmd.run.observers import Moment, Observer
 from rigidmd.run.record import Record
+from rigidmd.run.results import Results
+from rigidmd.run.simulation import Simulation
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.validation import did_you_mean, not_none
 from rigidmd.view.page import figure as figure_part
-
-if TYPE_CHECKING:
-    from rigidmd.run.results import Results
-    from rigidmd.run.simulation import Simulation
 
 #: Inches: narrow, to be readable on a phone.
 WIDTH, HEIGHT = 4.4, 2.3
@@ -79,11 +77,8 @@ def _body_panels(record: Record) -> list[Panel]:
         found.append(Panel("centre of mass (m)", [(k, seen[k]) for k in "xyz"]))
     parts = [(name, seen[name]) for name in ("kinetic", "potential", "energy") if name in seen]
     found.append(Panel("energies (J)", parts))
-    errors = [
-        (name.removesuffix("_error"), np.maximum(np.abs(values), FLOOR))
-        for name, values in seen.items()
-        if name.endswith("_error") and np.isfinite(values).any()
-    ]
+    known = [name for name, values in seen.items() if name.endswith("_error") and np.isfinite(values).any()]
+    errors = [(name.removesuffix("_error"), np.maximum(np.abs(seen[name]), FLOOR)) for name in known]
     found.append(Panel(f"relative errors of what is conserved (0 is drawn at {FLOOR:.0e})", errors, log=True))
     return found
 
@@ -141,19 +136,25 @@ def record_of(
     return Record(Path(), system.scene, system, summary, columns, [])
 
 
-def plot(results: "Results", names: tuple[str, ...], log: bool) -> "Picture":
-    """The figure of these columns, the named figure, or the first figure of the run. Raises KeyError."""
+def plot(results: Results, *columns: str, log: bool = False) -> Picture:
+    """A Matplotlib figure of a run, which a notebook displays and `savefig` writes.
+
+    columns : names of columns, drawn against time, with one panel for each unit; default: the main figure of the run
+        (energy.png, or the path of the axis of a body); or the name of another figure of a body ("angles",
+        "ellipsoids", "path", "invariants")
+    log : absolute values on a logarithmic axis. Raises KeyError
+    """
     figures = {}
-    if not set(names[:1]) & set(results.units):
+    if not set(columns[:1]) & set(results.units):
         figures = run_figures(results.system, results.samples, results.summary)
-    if not names and not figures:
+    if not columns and not figures:
         raise ValueError(f"too few samples for a figure: {len(results.samples)}")
-    wanted = names or tuple(figures)[:1]
+    wanted = columns or tuple(figures)[:1]
     if len(wanted) == 1 and wanted[0] in figures:
         return figures[wanted[0]]
-    check_names(names, results.samples.described, figures)
-    record = record_of(results.system, results.samples, results.summary, list(names))
-    return columns_figure(record, names, results.samples.described, log)
+    check_names(columns, results.samples.described, figures)
+    record = record_of(results.system, results.samples, results.summary, list(columns))
+    return columns_figure(record, columns, results.samples.described, log)
 
 
 def check_names(names: Sequence[str], described: dict[str, Column], figures: Any = ()) -> None:
@@ -211,7 +212,7 @@ class LivePlot(Observer):
         self._columns, self._pause = columns, pause
         self._spot: DisplayArea | None = None
 
-    def begin(self, run: "Simulation") -> None:
+    def begin(self, run: Simulation) -> None:
         """Prepare the drawing. Raises KeyError for an unknown column."""
         self._run, self._due = run, 0.0
         scene = cast(MolecularScene | BodyScene, run.scene)
@@ -227,10 +228,10 @@ class LivePlot(Observer):
         if self._spot is not None and clock.monotonic() >= self._due:
             self._draw()
 
-    def end(self, run: "Simulation", results: "Results") -> None:
+    def end(self, run: Simulation, results: Results) -> None:
         self._draw()
 
-    def failed(self, run: "Simulation") -> str:
+    def failed(self, run: Simulation) -> str:
         self._draw()
         return ""
 

@@ -52,14 +52,19 @@ def rdf(
     curve = Curve("rdf", ("r (A)", r), "g(r)", {}, level=1.0)
     found = AnalysisResult("rdf", "radial distribution functions", curves=[curve], notes=notes)
     for a, b in pairs:
-        if _pair_count(thinned, a, b) == 0:
+        if (pair_count := _pair_count(thinned, a, b)) == 0:
             found.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
-        g = np.array([_g(thinned, k, a, b, width, bins, shells) for k in range(len(thinned))])
+        g = np.empty((len(thinned), bins))
+        for k in range(len(thinned)):
+            at, owner = thinned.sites(a, slice(k, k + 1))
+            at_2, owner_2 = (at, owner) if a == b else thinned.sites(b, slice(k, k + 1))
+            counts = count_pairs(at[0], owner, at_2[0], owner_2, thinned.cell[k], width, bins)
+            g[k] = counts * float(thinned.volume[k]) / (pair_count * shells)
         # of the others that each a has, so that two molecules have one neighbour each
-        density = _pair_count(thinned, a, b) / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
+        density = pair_count / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
         title = f"g {a}-{b}"
-        parts = [part.mean(axis=0) for part in _split(g)]
+        parts = _block_means(g)
         curve.columns[title] = g.mean(axis=0)
         within = curve.columns[title] * shells * density
         curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
@@ -76,8 +81,9 @@ def _thinned(frames: RigidFrames, enough: int) -> tuple[RigidFrames, list[str]]:
     return found, [f"of {len(found)} of {len(frames)} frames, evenly spaced"] if len(found) < len(frames) else []
 
 
-def _split(values: np.ndarray) -> list[np.ndarray]:
-    return list(np.array_split(values, BLOCKS)) if len(values) >= 2 * BLOCKS else []
+def _block_means(values: np.ndarray) -> list[np.ndarray]:
+    parts = np.array_split(values, BLOCKS) if len(values) >= 2 * BLOCKS else []
+    return [part.mean(axis=0) for part in parts]
 
 
 def _pairs(frames: RigidFrames) -> list[tuple[str, str]]:
@@ -96,13 +102,6 @@ def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
     number = len(frames.system.model.species)
     same = np.bincount(first, minlength=number) @ np.bincount(second, minlength=number)
     return len(first) * len(second) - int(same)
-
-
-def _g(frames: RigidFrames, frame: int, a: str, b: str, width: float, bins: int, shells: np.ndarray) -> np.ndarray:
-    at, owner = frames.sites(a, slice(frame, frame + 1))
-    at_2, owner_2 = (at, owner) if a == b else frames.sites(b, slice(frame, frame + 1))
-    counts = count_pairs(at[0], owner, at_2[0], owner_2, frames.cell[frame], width, bins)
-    return counts * float(frames.volume[frame]) / (_pair_count(frames, a, b) * shells)
 
 
 def _peaks(
@@ -195,7 +194,7 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
     length = np.bincount(members, np.linalg.norm(vectors @ reciprocal, axis=1)) / np.bincount(members)
     title = f"S {name or 'centres'}"
     curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: values.mean(axis=0)}, level=1.0)
-    parts = [part.mean(axis=0) for part in _split(values)]
+    parts = _block_means(values)
     vectors_used = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
     found = AnalysisResult("structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used])
     if len(parts) > 1:

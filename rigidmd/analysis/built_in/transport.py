@@ -59,10 +59,6 @@ def interval_and_lags(frames: RigidFrames, what: str) -> tuple[float, int]:
     return frames.interval, lags
 
 
-def _displacements(frames: RigidFrames, kind: Kind, lags: int) -> np.ndarray:
-    return squared_displacement(frames.paths[:, kind.index], lags)
-
-
 @built_in("mean squared displacement of the centres of mass", position=50)
 def msd(frames: RigidFrames) -> AnalysisResult:
     """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth of the frames. Paths
@@ -70,7 +66,9 @@ def msd(frames: RigidFrames) -> AnalysisResult:
     interval, lags = interval_and_lags(frames, "a mean squared displacement")
     curve = Curve("msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True))
     for kind in frames.moving:
-        found = with_group_error(frames, kind, lambda part, group: _displacements(part, group, lags))
+        found = with_group_error(
+            frames, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
+        )
         curve.add(f"MSD {kind.name} (A^2)", *found)
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
@@ -93,7 +91,7 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
     half = len(time) // 2
 
     def slopes(part: RigidFrames, kind: Kind) -> np.ndarray:
-        seen = _displacements(part, kind, lags)[first:]
+        seen = squared_displacement(part.paths[:, kind.index], lags)[first:]
         whole, first_half, second_half = (
             np.polyfit(time[part], seen[part], 1)[0] for part in (slice(None), slice(half), slice(half, None))
         )
@@ -117,8 +115,11 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
         except OutputError as error:
             eta = eta._replace(note=str(error))
     for kind in frames.moving:
-        so_far = lambda part, group: _displacements(part, group, lags)[1:] / (6 * NM2_PER_S * later)  # noqa: E731
-        curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *with_group_error(frames, kind, so_far))
+        seen = with_group_error(
+            frames, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
+        )
+        so_far = (values[1:] / (6 * NM2_PER_S * later) for values in seen)
+        curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *so_far)
         name = f"D of {kind.name}"
         (D, bend), (error, doubt) = np.array(with_group_error(frames, kind, slopes)).tolist()
         if D <= 0 or abs(bend) > BEND * D + 2 * np.nan_to_num(doubt):

@@ -15,7 +15,7 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.engines.samples import COLUMNS, NOT_AVERAGED, Samples
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
-from rigidmd.run.mean_box import scale_to_mean_box
+from rigidmd.run.molecular import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
@@ -39,6 +39,10 @@ class AveragedQuantity(NamedTuple):
     only: str = ""  # the integrator that has it, where not all do
     is_main: bool = True  # whether it is printed and drawn; all are in accuracy.csv and accuracy.json
     of: str = "its value"  # name of the scale
+
+    @property
+    def unit_of_bias(self) -> str:
+        return self.bias_unit or self.unit
 
 
 @dataclass
@@ -72,6 +76,10 @@ class Averages:
 
     def __post_init__(self):
         self._fits: dict[str, BiasFit] = {}
+
+    @property
+    def methods(self) -> list[str]:
+        return list(dict.fromkeys(run.method for run in self.runs))
 
     @property
     def main(self) -> list[AveragedQuantity]:

@@ -12,10 +12,6 @@ from rigidmd.view.page import chips, code, items, page, plain, section, table, w
 FILES = ("accuracy.csv", "accuracy.json", "averages.png", "averages.html")
 
 
-def _bias_unit(quantity: AveragedQuantity) -> str:
-    return quantity.bias_unit or quantity.unit
-
-
 def full_table(found: Averages) -> Table:
     """Means and biases of all runs, with their errors."""
     columns = [
@@ -25,7 +21,7 @@ def full_table(found: Averages) -> Table:
     ]  # fmt: skip
     for q in found.quantities:
         columns += with_error(f"{q.name} ({q.unit})", lambda run, q=q: (point := found.point(run, q)) and point[2:])
-        columns += with_error(f"bias of {q.name} ({_bias_unit(q)})", lambda run, q=q: found.bias(run, q))
+        columns += with_error(f"bias of {q.name} ({q.unit_of_bias})", lambda run, q=q: found.bias(run, q))
     return Table([*columns, Column("failure", lambda run: run.failure)], found.runs)
 
 
@@ -36,7 +32,7 @@ def brief_table(found: Averages) -> Table:
         Column("step (fs)", lambda run: f"{run.timestep:g}"),
         Column("forces/ps", lambda run: f"{run.forces_per_ps:.4g}"),
         Column("s/ns", lambda run: "fails" if run.failure else run.seconds_per_ns),
-        *(Column(f"{q.name} ({'kT' if q.name == 'U' else _bias_unit(q)})",
+        *(Column(f"{q.name} ({'kT' if q.name == 'U' else q.unit_of_bias})",
                  lambda run, q=q: (bias := found.bias(run, q)) and format_signed(*bias)) for q in found.main),
     ], found.runs)  # fmt: skip
 
@@ -65,16 +61,12 @@ def describe_references(found: Averages) -> list[str]:
     return lines
 
 
-def methods_of(found: Averages) -> list[str]:
-    return list(dict.fromkeys(run.method for run in found.runs))
-
-
 def _describe_limits(found: Averages) -> list[str]:
     lines = []
     for quantity in found.main:
         steps = [
             f"{method} {'' if at[1] else 'none seen, more than '}{at[0]:.2g} fs"
-            for method in methods_of(found)
+            for method in found.methods
             if (at := found.step_at_limit(method, quantity))
         ]
         scale = f"{BIAS_LIMIT:.0%} of {quantity.of}"
@@ -102,13 +94,13 @@ def write_averages(folder: Path, found: Averages, command: str) -> list[Path]:
 
 
 def to_json(found: Averages, command: str) -> dict:
-    quantities, methods = {}, methods_of(found)
+    quantities, methods = {}, found.methods
     for quantity in found.quantities:
         quantities[quantity.name] = {"unit": quantity.unit}
         if (fit := found.fit(quantity)) is not None:
             steps = {method: at for method in methods if (at := found.step_at_limit(method, quantity))}
             quantities[quantity.name] |= {
-                "bias_unit": _bias_unit(quantity), "reference": fit.limit, "reference_error": fit.limit_error,
+                "bias_unit": quantity.unit_of_bias, "reference": fit.limit, "reference_error": fit.limit_error,
                 "chi2": fit.chi2, "degrees_of_freedom": fit.freedom,
                 "longest_step_in_fit_fs": fit.longest, "bias_limit": found.bias_limit(quantity),
                 "step_of_that_bias_fs": {name: {"step": step, "seen": seen} for name, (step, seen) in steps.items()},
@@ -136,7 +128,7 @@ def averages_figure(found: Averages):
     """Bias against the step, a panel for each quantity, with error bars and the band within 1 %."""
     shown = [quantity for quantity in found.main if found.points(quantity)]
     figure, axes = panel_grid(len(shown), 3, 3.7, 3.0, 0.9)
-    methods = methods_of(found)
+    methods = found.methods
     handles = {}
     for axis, quantity in zip(axes, shown, strict=True):
         limit = found.bias_limit(quantity)
@@ -147,7 +139,7 @@ def averages_figure(found: Averages):
                 steps, values, errors = zip(*at, strict=True)
                 style = curve_style(methods.index(method))
                 handles[method] = axis.errorbar(steps, values, errors, ms=3.5, lw=1.1, capsize=2, **style)
-        axis.set_title(f"{quantity.name}, {_bias_unit(quantity)}", loc="left", fontsize=9, color=INK, pad=17)
+        axis.set_title(f"{quantity.name}, {quantity.unit_of_bias}", loc="left", fontsize=9, color=INK, pad=17)
         axis.annotate(f"band: {BIAS_LIMIT:.0%} of {quantity.of}", (0, 1), (0, 4), xycoords="axes fraction",
                       textcoords="offset points", fontsize=7, color=FAINT)  # fmt: skip
         axis.set_xlim(left=0)
@@ -160,7 +152,7 @@ def averages_figure(found: Averages):
 
 
 def averages_page(found: Averages, command: str) -> str:
-    methods = methods_of(found)
+    methods = found.methods
     colored = chips(methods)
 
     def step(method: str, quantity: AveragedQuantity) -> str:

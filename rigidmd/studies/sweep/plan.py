@@ -271,8 +271,5 @@ def _differences_between(there: Manifest, now: Manifest) -> list[str]:
     if found:
         return found
     known = {point.folder: point.scene_sha256 for point in there.points}
-    return [
-        f"a file that {point.folder} reads has changed"
-        for point in now.points
-        if known.get(point.folder, point.scene_sha256) != point.scene_sha256
-    ]
+    changed = [p.folder for p in now.points if known.get(p.folder, p.scene_sha256) != p.scene_sha256]
+    return [f"a file that {folder} reads has changed" for folder in changed]
