@@ -82,9 +82,9 @@ def parts(record: Record, animation: str = "") -> Iterator[str]:
 def _stages(record: Record) -> Iterator[str]:
     """Means and drifts of the stages, as the summary has them, from log.csv, which a run that has not ended has too."""
     system, samples, known = record.system, record.log, (record.summary or {}).get("stages", ())
-    for place, k in enumerate(np.unique(samples["stage"]).tolist()):
+    for row, k in enumerate(np.unique(samples["stage"]).tolist()):
         if not system.scene.stages[k].is_minimisation:
-            ended = known[place] if place < len(known) else {}
+            ended = known[row] if row < len(known) else {}
             moves = ended.get("moves_tried", 0), ended.get("moves_accepted", 0)
             stage = stage_summary(system, samples, k, ended.get("computing_s", 0.0), moves)
             yield f"<p>{html.escape(stage_title(stage))}</p>"

@@ -112,7 +112,7 @@ def mean_square_rate(system: System, state: State, k: int) -> float:
 
 
 def _integrator(system: System, k: int, stage: Stage) -> Scheme:
-    """The integrator of a pilot run, in which `stage` takes the place of stage k."""
+    """The integrator of a pilot run, with `stage` instead of stage k."""
     stages = system.scene.stages
     scene = system.scene.model_copy(update={"stages": (*stages[:k], stage, *stages[k + 1 :])})
     return integrator_of_stage(replace(system, scene=scene), k)
