@@ -6,8 +6,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F1", "g(r): the mean volume of the run, not that of each frame",
         "analysis/built_in/structure.py",
-        "    return counts * float(frames.volume[frame]) / (",
-        "    return counts * float(frames.volume.mean()) / (",
+        "            g[k] = counts * float(thinned.volume[k]) / (",
+        "            g[k] = counts * float(thinned.volume.mean()) / (",
         ("test_mixtures.py::test_pairs_of_a_mixture_are_counted_against_the_pairs_that_there_are",),
     ),
     Mutation(
