@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from support import ROOT
 
 import rigidmd
 from rigidmd import Scene, Simulation
+from rigidmd.units import GRAM_PER_CM3
 
 pytestmark = pytest.mark.soak
 
@@ -70,3 +72,28 @@ def test_nitrogen_diffuses_as_its_correlation_of_velocities_says():
     found = 10 * np.trapezoid(memory[: int(3 / 0.02)], dx=0.02) * kT / mass  # 1e-9 m²/s
     print(own, "| by its velocities:", found)
     assert abs(own.value - found) < 0.1 * own.value + 4 * own.error
+
+
+def test_a_slab_of_water_has_the_published_density_and_surface_tension():
+    """NIST SAT-TMMC of TIP4P/2005; Vega & de Miguel 2007, J. Chem. Phys. 126, 154707."""
+    scene = Scene.read(ROOT / "systems" / "water_slab.toml", {"stages.production.duration_ps": 1000.0})
+    results = Simulation(scene).run()
+    assert near(rigidmd.analysis.interfaces(results).value("liquid"), 0.9965, slack=0.0015)
+    assert near(rigidmd.analysis.surface_tension(results).value(), 69.3, slack=0.9)
+
+
+def test_argon_coexists_with_its_vapour_as_published():
+    """NIST SAT-TMMC, Lennard-Jones with linear-force shift at 3 sigma at a reduced temperature of 0.8."""
+    stage = {"ensemble": "nvt", "integrator": "baoab", "temperature_K": 95.84, "timestep_fs": 10.0}
+    scene = {
+        "box": {"lengths_A": [34.05, 34.05, 93.0], "vacuum_A": 100.0},
+        "molecules": [{"model": "argon", "count": 2000}],
+        "forces": {"cutoff_A": 10.215, "truncation": "force_shift"},
+        "start": {"temperature_K": 95.84},
+        "stages": [stage | {"duration_ps": 400.0}, stage | {"duration_ps": 6000.0}],
+        "output": OUTPUT | {"trajectory_interval_ps": 5.0, "pressure_tensor_interval_ps": 0.2},
+    }
+    results = Simulation(Scene.from_dict(scene)).run()
+    found, unit = rigidmd.analysis.interfaces(results), 39.948 / 3.405**3 / GRAM_PER_CM3
+    assert near(found.value("liquid"), 0.7294 * unit)
+    assert near(found.value("vapour"), 0.0200 * unit)
