@@ -143,11 +143,28 @@ def table_text(found: IntegratorAccuracy) -> str:
 
 
 def recommendations(found: IntegratorAccuracy) -> list[str]:
-    """Sentences on the cheapest integrator for each accuracy, the reference, the longest stable steps, what failed or
-    was left out, and the timings."""
+    """Sentences on the cheapest integrator for each accuracy, and `remarks`."""
+    s, lines = found.trial_system, []
+    for error, best, faster, rivals in cheapest(found):
+        faster = f": {faster}" if faster else ""
+        rivals = f"; as fast within the spread of the timings: {rivals}" if rivals else ""
+        lines.append(f"for {error} over {_span(found)} the cheapest is {best}{faster}{rivals}")
+    if lines and s.time_unit == "fs":
+        lines.append(
+            f"energy errors grow over longer runs, by a random walk where forces are truncated: --span measures them "
+            f"over more than {s.span:g} ps"
+        )
+    return [*lines, *remarks(found)]
+
+
+def _span(found: IntegratorAccuracy) -> str:
+    return f"{found.trial_system.span:g} {'ps' if found.trial_system.time_unit == 'fs' else 's'}"
+
+
+def remarks(found: IntegratorAccuracy) -> list[str]:
+    """Sentences on the reference, the longest stable steps, what failed or was left out, and the timings."""
     s = found.trial_system
     lines = [
-        *describe_cheapest(found),
         f"unit of energy errors: {s.energy_unit}{s.energy_note}",
         f"reference: {s.reference} in {found.reference_steps} steps, error about {found.reference_error:.0e}",
     ]
@@ -188,11 +205,10 @@ def _describe_timings(found: IntegratorAccuracy) -> list[str]:
 COMMON = "velocity_verlet"  # integrator to compare with
 
 
-def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
-    """Sentences: the cheapest integrator for each error of the energy, and of Q or X, and the others that are as fast.
-    Errors with the same answer share a sentence."""
-    s, lines = found.trial_system, []
-    per, unit = "ps" if s.time_unit == "fs" else "s", s.time_unit
+def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
+    """For each error of the energy, and of Q or X: the cheapest integrator, how much faster than `COMMON` it is, others
+    that are as fast. Errors with the same answer are one row."""
+    s, rows, unit = found.trial_system, [], found.trial_system.time_unit
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
     kinds = {
         "energy_rms": ("an energy error", s.energy_unit),
@@ -200,7 +216,7 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
     }
     for error, (what, of) in kinds.items():
         worst = max((getattr(t, error) for t in found.trials if not t.diverged), default=0.0)
-        answers: dict[str, list[float]] = {}  # -> the targets that have it
+        answers: dict[tuple[str, str, str], list[float]] = {}  # -> the targets that have it
         for target in 10.0 ** np.arange(0, -15, -2):
             names = dict.fromkeys(t.integrator for t in found.trials)
             reached = {name: at for name in names if (at := found.time_for(name, error, target))}
@@ -211,23 +227,15 @@ def describe_cheapest(found: IntegratorAccuracy) -> list[str]:
             at, common = reached.pop(best), reached.get(COMMON)
             slow = at.seconds * (1 + at.spread / 2)
             rivals = {name: r.step for name, r in reached.items() if r.seconds * (1 - r.spread / 2) < slow}
-            answer = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}"
+            chosen, faster = f"{best} at {at.step:.2g} {unit}{f' ({at.limit})' if at.limit else ''}", ""
             if common and COMMON not in rivals:
-                faster = f"{common.seconds / at.seconds:.1f} times faster"
-                answer += f": {faster} than {COMMON} at {common.step:.2g} {unit}"
-            if rivals:
-                steps = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
-                answer += f"; as fast within the spread of the timings: {steps}"
-            answers.setdefault(answer, []).append(target)
+                faster = f"{common.seconds / at.seconds:.1f} times faster than {COMMON} at {common.step:.2g} {unit}"
+            others = ", ".join(f"{name} at {step:.2g} {unit}" for name, step in rivals.items())
+            answers.setdefault((chosen, faster, others), []).append(target)
         for answer, targets in answers.items():
             span = " to ".join(f"{target:.0e}" for target in dict.fromkeys((targets[0], targets[-1])))
-            lines.append(f"for {f'{what} of {span} {of}'.rstrip()} over {s.span:g} {per} the cheapest is {answer}")
-    if lines and s.time_unit == "fs":
-        lines.append(
-            f"energy errors grow over longer runs, by a random walk where forces are truncated: --span measures them "
-            f"over more than {s.span:g} ps"
-        )
-    return lines
+            rows.append((f"{what} of {span} {of}".rstrip(), *answer))
+    return rows
 
 
 def write_accuracy(folder: Path, found: IntegratorAccuracy, command: str) -> list[Path]:
@@ -290,8 +298,9 @@ def accuracy_figure(found: IntegratorAccuracy):
 
 def accuracy_page(found: IntegratorAccuracy, command: str) -> str:
     colored = chips(list(dict.fromkeys(t.integrator for t in found.trials)))
+    titles = [f"for, over {_span(found)}", "the cheapest is", "gain", "as fast within the spread of the timings"]
     parts = [
-        section("Recommendations", items(recommendations(found))),
+        section("Recommendations", table(titles, cheapest(found), words=True), items(remarks(found))),
         section("Error against run time", wide(accuracy_figure(found), "accuracy", "log error over log run time")),
         section("All trials", table(*trial_table(found).shown(), marked=colored)),
         section("How to repeat it", code(command)),
