@@ -359,6 +359,8 @@ class CalculatorForce(Force):
 def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
     """Frames of a run for `ase.io.read`; `name` is its folder, or the trajectory in it. Raises OutputError."""
     record = read_record(Path(name) if Path(name).is_dir() else Path(name).parent)
+    if record.is_body:
+        raise TypeError("this is a run of a single body, which has no atoms")
     found = read_frames(record.trajectory, record.system.site_count, most=1 << 60)
     arrays = [[None] * len(found.time) if a is None else a for a in (found.positions, found.velocities, found.cells)]
     return [atoms_of_sites(record.system, *frame) for frame in zip(*arrays, found.time.tolist(), strict=True)][index]

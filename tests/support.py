@@ -283,7 +283,7 @@ HOMES = {
     "figures.body": "FIGURES",
     "figures.run": "energy_figure",
     "analysis.files": "ANALYSIS analyse_folder read_results",
-    "analysis.built_in.interfaces": "interfaces surface_tension",
+    "analysis.built_in.interfaces": "Slab fitted interfaces surface_tension",
     "analysis.built_in.transport": "MPA_S NM2_PER_S correlation diffusion msd squared_displacement viscosity",
     "studies.sweep.replicas": "over_replicas",
     "analysis.built_in.structure": "density_profile hydrogen_bonds rdf structure_factor",

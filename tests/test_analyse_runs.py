@@ -211,7 +211,7 @@ def topology(water):
     species = system.species[0]
     sites = {
         "position": system.site_positions(system.state).reshape(216, -1, 3), "template": species.positions_body,
-        "edge": system.state.cell[0, 0], "name": species.site_names, "mass": species.masses, "charge": species.charges,
+        "edges": system.state.cell.diagonal(), "name": species.site_names, "mass": species.masses, "charge": species.charges,
         "sigma": np.where(species.epsilon > 0, species.sigma, 1.0), "epsilon": species.epsilon / 100,
     }  # fmt: skip
     folder = water.parent / "gromacs"

@@ -267,8 +267,6 @@ def _rigid_frames(
     cells = np.tile(NO_CELL, (len(keep), 1, 1)) if stored.cells is None else stored.cells[keep]
     wrapped = system.scene.output.positions == "wrapped"
     bodies, corrections = fit_frames(system, stored.positions[keep], velocities, cells, wrapped, progress)
-    if not all(np.isfinite(array).all() for array in bodies if array is not None):
-        raise OutputError("a frame has values that are not finite numbers")
     samples = shown & (columns["time"] >= begin - slack) & (columns["time"] <= last + slack)
     if tensor is not None:
         tensor = tensor[(tensor[:, 0] >= begin - slack) & (tensor[:, 0] <= last + slack)]

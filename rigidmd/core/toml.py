@@ -72,22 +72,28 @@ def plain_values(data: Any, depth: int = 0) -> Any:
     return data
 
 
+def values_in(data: Any) -> Iterator[tuple[list, Any]]:
+    """All values in nested tables and lists in their order, each with its path of keys, before the values in it."""
+    rest: list[tuple[list, Any]] = [([], data)]
+    while rest:
+        keys, value = rest.pop()
+        yield keys, value
+        if isinstance(value, dict | list | tuple):
+            inner = list(value.items() if isinstance(value, dict) else enumerate(value))
+            rest += [([*keys, key], part) for key, part in reversed(inner)]
+
+
 def impossible_values(data: Any) -> list[tuple[list, str]]:
     """Values that are not allowed in any table, each with its path of keys and what is wrong with it. These are tables
     deeper than `DEEPEST`, whole numbers of more than 64 bits and texts with unprintable characters."""
     found: list[tuple[list, str]] = []
-    rest: list[tuple[list, Any]] = [([], data)]
-    while rest:
-        keys, value = rest.pop()
+    for keys, value in values_in(data):
         match value:
             case dict() | list() | tuple() if len(keys) > DEEPEST:
                 return [(keys[:DEEPEST], f"has lists or tables more than {DEEPEST} deep")]
             case dict():
-                rest += [([*keys, key], inner) for key, inner in value.items()]
                 odd = [key for key in value if isinstance(key, str) and UNPRINTABLE.search(key)]
                 found += [([*keys, key], "has a control character in its name") for key in odd]
-            case list() | tuple():
-                rest += [([*keys, k], inner) for k, inner in enumerate(value)]
             case int() if not LEAST_WHOLE <= value <= LARGEST_WHOLE:
                 found.append((keys, "is a whole number of more than 64 bits"))
             case str() if UNPRINTABLE.search(value):

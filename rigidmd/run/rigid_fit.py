@@ -27,8 +27,10 @@ class RigidFit:
         self._rotates = len(system.state.rotation) > 0
 
     def bodies(self, sites: np.ndarray, velocities: np.ndarray | None) -> Bodies:
-        """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole.
-        Q of a linear molecule has an arbitrary rotation about its axis."""
+        """Bodies of a frame from sites (s, 3), Å, and their velocities. Raises OutputError if a molecule is not whole,
+        or a number not finite. Q of a linear molecule has an arbitrary rotation about its axis."""
+        if not (np.isfinite(sites).all() and (velocities is None or np.isfinite(velocities).all())):
+            raise OutputError("positions or velocities are not finite numbers")
         centre = np.empty((self._n, 3))
         Q = np.tile(np.eye(3), (self._n if self._rotates else 0, 1, 1))
         velocity, L = np.empty((self._n, 3)), np.zeros((len(Q), 3))

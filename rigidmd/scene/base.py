@@ -16,6 +16,7 @@ from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
 from rigidmd.core.shipped import examples
 from rigidmd.core.toml import (
     DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
+    values_in,
 )  # fmt: skip
 from rigidmd.errors import SceneError
 from rigidmd.io.formats import Format, written
@@ -95,14 +96,9 @@ class Scene(Section, Displayed):
         return self._folder / file
 
     @property
-    def named_files(self) -> dict[str, str]:
-        """The other files that the scene reads: dotted key -> name in the scene."""
-        return {}
-
-    @property
     def inputs(self) -> dict[str, Path]:
         """The other files that the scene reads: dotted key -> path."""
-        return {key: self.path(name) for key, name in self.named_files.items()}
+        return {}
 
     @property
     def embedded_files(self) -> dict[str, bytes]:
@@ -177,6 +173,16 @@ class Scene(Section, Displayed):
         wrong = numbers_out_of_range(data, *kind.SIZES)
         faults += [f"{location_of(keys, text, overridden)}: {fault}" for keys, fault in wrong]
         faults += kind.contradictions(data, text)
+        for keys, name in values_in(data):
+            key = ".".join(map(str, keys))
+            if not (isinstance(name, str) and FILE_KEYS.fullmatch(key)) or key in (embedded_files or {}):
+                continue
+            where, path = location_of(keys, text, overridden), folder / name
+            if not (embedded_files or is_within(key, overridden) or _is_inside(path, folder)):
+                advice = f"move it there, or set it by --set {key}=PATH"
+                faults.append(f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}")
+            elif fault := unreadable_reason(path):
+                faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
         whole, rows = with_registered_rows(exact_names(data, kind))
         scene = None
         try:
@@ -186,17 +192,6 @@ class Scene(Section, Displayed):
         if scene is None or faults:
             raise SceneError(source, [fault + _removal_hint(fault, data, overridden) for fault in faults])
         scene._source, scene._folder, scene._embedded_files = source, folder, embedded_files or {}
-        for key, path in scene.inputs.items():
-            keys = [part if (number := parse_whole_number(part)) is None else number for part in key.split(".")]
-            where = location_of(keys, text, overridden)
-            if not (embedded_files or is_within(key, overridden) or _is_inside(path, folder)):
-                advice = f"move it there, or set it by --set {key}=PATH"
-                name = shorten_repr(scene.named_files[key])
-                faults.append(f"{where}: {name} is outside the scene's folder; {advice}")
-            elif fault := unreadable_reason(path):
-                faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
-        if faults:
-            raise SceneError(source, faults)
         return scene
 
 

@@ -212,7 +212,7 @@ class MolecularScene(Scene):
         return next((stage for stage in self.stages if not stage.is_minimisation), None)
 
     @property
-    def named_files(self) -> dict[str, str]:
+    def inputs(self) -> dict[str, Path]:
         found: dict[str, str | None] = {}
         if self.structure is not None and "structure.file" not in self.embedded_files:
             found["structure.file"] = self.structure.file
@@ -221,7 +221,7 @@ class MolecularScene(Scene):
             found |= {f"molecules.{k}.{key}": getattr(species, key) for key in SPECIES_FILES}
         for k, force in enumerate(self.forces.custom):
             found |= {f"forces.custom.{k}.{key}": getattr(force, key) for key in FORCE_FILES}
-        return {key: name for key, name in found.items() if name is not None}
+        return {key: self.path(name) for key, name in found.items() if name is not None}
 
     @property
     def structure_source(self) -> str:

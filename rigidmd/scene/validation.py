@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, Vali
 from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters
-from rigidmd.core.toml import line_of, shorten_repr, shorten_text
+from rigidmd.core.toml import line_of, shorten_repr, shorten_text, values_in
 from rigidmd.errors import MOST_SHOWN
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -120,17 +120,12 @@ def validation_messages(
 
 def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[list, str]]:
     """Path of keys and message of numbers in nested tables whose absolute value is outside these limits."""
-    found: list[tuple[list, str]] = []
-    rest: list[tuple[list, Any]] = [([], data)]
-    while rest:
-        keys, value = rest.pop()
-        if isinstance(value, dict | list | tuple):
-            inner = value.items() if isinstance(value, dict) else enumerate(value)
-            rest += [([*keys, key], part) for key, part in inner]
-        elif isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value):
-            bounds = f"{least:g} and {largest:g}".replace("e+", "e")
-            found.append((keys, f"is {value:g}, must be 0 or between {bounds}"))
-    return found[::-1]
+    bounds = f"{least:g} and {largest:g}".replace("e+", "e")
+    return [
+        (keys, f"is {value:g}, must be 0 or between {bounds}")
+        for keys, value in values_in(data)
+        if isinstance(value, float) and value != 0 and not least <= abs(value) <= largest and isfinite(value)
+    ]
 
 
 def _either(sentences: list[str]) -> str:

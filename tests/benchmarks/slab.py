@@ -11,12 +11,13 @@ Both are analysed by the same functions, GROMACS after its own 60 ps.
 
 import argparse
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 
-from rigidmd.analysis.built_in.interfaces import Slab, fitted
-from rigidmd.core.statistics import mean_and_error
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from support import Slab, fitted, mean_and_error
 
 SCENE = Path(__file__).parents[2] / "systems" / "water_slab.toml"
 EQUILIBRATION, BLOCKS = 60.0, 10
