@@ -713,3 +713,19 @@ def test_a_run_that_blows_up_says_so_and_keeps_the_last_good_state(tmp_path):
     with np.load(tmp_path / "out" / "last_good_state.npz") as saved:
         assert saved["position"] == pytest.approx(good, abs=1.0)
         assert np.isfinite(saved["position"]).all()
+
+
+def test_files_and_keys_that_are_wrong_are_told_at_once(tmp_path):
+    (tmp_path / "scene.toml").write_text(
+        '[structure]\nfile = "../x.pdb"\n[[molecules]]\nmodel = "spce"\ncoont = 3\n[[molecules]]\nfile = "no.toml"\n'
+        "[forces]\ncutoff_A = 1e300\n[[stages]]\nduration_ps = -1.0\n"
+    )
+    with pytest.raises(SceneError) as raised:
+        Scene.read(tmp_path / "scene.toml")
+    said = str(raised.value)
+    for words in (
+        "line 2: structure.file: '../x.pdb' is outside the scene's folder", "line 5: molecules.0.coont: unknown key",
+        "line 7: molecules.1.file: there is no such file", "line 9: forces.cutoff_A: is 1e+300",
+        "line 11: stages.0.duration_ps: is -1",
+    ):  # fmt: skip
+        assert words in said
