@@ -82,6 +82,15 @@ def shaken(system: System, seed: int, spread: float = 0.4) -> tuple[System, Engi
     return system, system.engine(), state
 
 
+def bits_with(threads: int, system: System, state: State) -> tuple:
+    """All bits of forces, torques, energies and virials of a state, computed by so many threads."""
+    engine = system.engine()
+    engine.threads = threads
+    load, tallies = engine.evaluate(state)
+    by_term = [(name, tally.energy, tally.virial.tobytes()) for name, tally in tallies.items()]
+    return load.force.tobytes(), load.torque_body.tobytes(), by_term
+
+
 def built(counts, edge, seed=0, spread=0.4, **sections) -> tuple[System, Engine, State]:
     """`shaken` of `small_scene`: system, engine, state."""
     return shaken(build(small_scene(counts, edge, **sections)), seed, spread)

@@ -96,7 +96,7 @@ class Workload:
     permittivity: float  # of the reaction field
     nstlist: int  # what suits GROMACS best at 2 fs
     timesteps: tuple[float, ...]  # of accuracy unless others are asked for, fs
-    reference: str  # file of --start reference
+    reference: str  # file of --start reference; empty: it has none, and the start is grown
     pme: bool = False  # smooth particle mesh Ewald in place of the reaction field
     liquid: float | None = None  # height of a slab in a box of edges (edge, edge, height); None for a cube of liquid
     height: float | None = None
@@ -274,7 +274,7 @@ def start_of(name: str, source: str) -> Start:
         print(f"{name}: making the start, kept in {folder}", flush=True)
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent) as unfinished:
-            (grow if source == "own" else take)(work, Path(unfinished))
+            (grow if source == "own" or not work.reference else take)(work, Path(unfinished))
             (Path(unfinished) / "start.npz").replace(folder / "start.npz")
     return describe(work, folder)
 
