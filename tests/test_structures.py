@@ -33,6 +33,7 @@ from support import (
     every_site,
     load_model,
     molecule,
+    nearest_images,
     pairs_within,
     random_rotations,
     read_geometry,
@@ -727,9 +728,24 @@ def test_pairs_within_a_radius_in_any_cell():
             (i, j) for i in range(15) for j in range(i) if np.linalg.norm(step[i, j] + images, axis=1).min() <= radius
         }
         assert 0 < len(wanted) < 105
-        i, j, distance = pairs_within(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
+        i, j, step = pairs_within(points + rng.integers(-5, 6, (15, 3)) @ cell, cell, radius)
         assert {(max(a, b), min(a, b)) for a, b in zip(i, j, strict=True) if a != b} == wanted
-        assert distance.max(initial=0.0) <= radius
+        assert np.linalg.norm(step, axis=1).max(initial=0.0) <= radius
+        images = (step - points[j] + points[i]) @ np.linalg.inv(cell)
+        assert images == pytest.approx(np.round(images), abs=1e-9)
+
+
+def test_nearest_images_in_any_cell():
+    """Also in a cell whose edges lie so near to each other that rounded fractions give another image."""
+    rng = np.random.default_rng(1)
+    images = np.stack(np.meshgrid(*[np.arange(-25, 26)] * 3), -1).reshape(-1, 3)
+    for cell in (np.diag([4.0, 5.0, 6.0]), [[10.0, 0, 0], [9.9, 2.0, 0], [3.0, 1.5, 7.0]], [[5.0, 0, 0], [4.0, 5.0, 0], [-8.0, 7.0, 5.0]]):  # fmt: skip
+        vectors = rng.uniform(-12, 12, (10, 3))
+        shortest = np.linalg.norm(vectors[:, None] + images @ np.array(cell), axis=2).min(axis=1)
+        found = nearest_images(vectors, np.array(cell))
+        assert np.linalg.norm(found, axis=1) == pytest.approx(shortest)
+        whole = (found - vectors) @ np.linalg.inv(cell)
+        assert whole == pytest.approx(np.round(whole), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -749,6 +765,69 @@ def test_close_sites_are_those_of_all_pairs(counts):
     assert len(found) > 5
     assert [pair[:2] for pair in found] == [tuple(pair) for pair in np.argwhere(close).tolist()]
     assert [pair[2] for pair in found] == pytest.approx(apart[close].tolist())
+
+
+def rod(*labels: str, length=1.3) -> Molecule:
+    """A straight chain of atoms."""
+    masses = {"C": 12.011, "N": 14.007, "O": 15.999, "H": 1.008}
+    sites = [
+        Site(name=f"{e}{k}", element=e, mass_u=masses[e], position_A=(length * k, 0.0, 0.0))
+        for k, e in enumerate(labels, 1)
+    ]
+    return molecule("rod", tuple(sites), residue_names=("ROD",))
+
+
+#: Unit cells that are shorter than half of their molecules: upright, and with edges that lean on each other.
+SHORT_CELLS = {
+    "upright": [[7.0, 0, 0], [0, 5.0, 0], [0, 0, 6.0]],
+    "leaning": [[5.0, 0, 0], [3.0, 6.0, 0], [-4.0, 5.0, 7.0]],
+}
+
+
+@pytest.mark.parametrize("cell", SHORT_CELLS)
+@pytest.mark.parametrize("ending", ["xyz", "gro", "gro without residues", "cif"])
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_molecules_longer_than_the_cell(cell, ending, shuffled, tmp_path):
+    """They pass through faces more than once; no two of their atoms are nearest images but neighbours."""
+    rng, cell = np.random.default_rng(3), np.array(SHORT_CELLS[cell])
+    kind = rod("N", "C", "C", "C", "C", "O")
+    for seed in range(100):  # an orientation in which its atoms keep a distance from those of its images
+        truth = Truth([kind], seed, cell=cell)
+        at = np.array([x for *_, x, _ in truth.atoms()])
+        images = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3), -1).reshape(-1, 3)
+        images = images[(images != 0).any(axis=1)] @ cell
+        if np.linalg.norm(at[:, None, None] - at[None, :, None] + images, axis=-1).min() > 2.2:
+            break
+    assert np.linalg.norm(at[-1] - at[0]) > np.linalg.norm(cell, axis=1).min()
+    atoms = wrapped(truth.atoms(), cell)
+    if shuffled:
+        rng.shuffle(atoms)
+    text, error = xyz(atoms, cell), 1e-6
+    if ending == "cif":
+        plain = ase.Atoms([a[1] for a in atoms], [a[3] for a in atoms], cell=cell, pbc=True)
+        ase.io.write(tmp_path / "b.cif", plain)
+        text, error = (tmp_path / "b.cif").read_text(), 1e-4
+    elif ending.startswith("gro"):
+        (a, _, _), (bx, by, _), (cx, cy, cz) = cell / 10
+        box = " ".join(f"{x:.9f}" for x in (a, by, cz, 0, 0, bx, 0, cx, cy))
+        text = gro(atoms, box, 9, residues="without" not in ending, residue_names={0: "ROD"})
+    found = read(tmp_path, text, f"a.{ending.split()[0]}", [kind], repeat=(3, 3, 3))
+    assert len(found.species) == 27
+    assert found.residual_max < error
+    one = read(tmp_path, text, f"a.{ending.split()[0]}", [kind], periodic=False)
+    same_molecules(one, truth, [kind], 10 * error)
+
+
+@pytest.mark.parametrize("elements", ["CC", "CCO"])
+def test_polymers_are_no_molecules(elements, tmp_path):
+    """A chain of which the cell has one repeat unit, whose atoms fit a template."""
+    kind = rod(*elements)
+    cell = np.diag([1.3 * len(elements), 8.0, 9.0])
+    rows = [("", e, 0, np.array([1.3 * k + 0.4, 2.0, 3.0]), None) for k, e in enumerate(elements)]
+    with pytest.raises(StructureError, match=r"molecule 1 .*\(C2( O)?\) is bonded to its own image .* a polymer"):
+        read(tmp_path, xyz(rows, cell), "a.xyz", [kind])
+    cell[0, 0] += 2.0  # molecules in a row
+    assert len(read(tmp_path, xyz(rows, cell), "a.xyz", [kind]).species) == 1
 
 
 # formats

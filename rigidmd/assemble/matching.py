@@ -1,7 +1,7 @@
 """Assigns the atoms of a file to molecules, by residues or else by bonding distance, and fits rigid templates."""
 
 from collections import Counter, deque
-from collections.abc import Hashable, Iterable
+from collections.abc import Collection, Hashable, Iterable
 from functools import cache
 from itertools import groupby
 from math import inf
@@ -11,13 +11,15 @@ import numpy as np
 
 from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
 from rigidmd.io.formats.bonds import shortest_links
-from rigidmd.io.formats.cells import pairs_within
+from rigidmd.io.formats.cells import make_whole, pairs_within
 from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 
 #: Atoms are bonded up to this multiple of the template's longest bond between atoms of the same labels. Hydrogen bonds
 #: of water are at least 1.6 times as long as its bonds.
 BOND_REACH = 1.25
+#: Two ways along bonds that end this close, relative to a bond, end at the same image of an atom.
+SAME_PLACE = 1e-3
 #: Partial assignments tried before the search for an order of atoms gives up.
 MOST_TRIES = 20_000
 MOST_DISTANCES = 1_000_000  # computed at once
@@ -64,8 +66,8 @@ def match(
     if isinstance(by_residue, MatchedMolecules):
         numbers = [atoms.residue[run[0]][0] for run in runs]
         return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
-    runs_by_bonds = _bonded(atoms, kinds, species, cell)
-    by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance")
+    runs_by_bonds, endless = _bonded(atoms, kinds, species, cell)
+    by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance", endless)
     if isinstance(by_bonds, MatchedMolecules):
         note = "its residues are not the molecules of the scene, which were found by bonding distance"
         by_bonds.notes.extend([note] if by_residue else [])
@@ -87,7 +89,8 @@ def refit(
     fit = TemplateFit(*map(np.zeros_like, matched.fit))
     for k in np.unique(matched.species):
         members = np.flatnonzero(matched.species == k)
-        points = _make_whole(position[np.array([matched.atoms[m] for m in members])], cell)
+        points = position[np.array([matched.atoms[m] for m in members])]
+        points = make_whole(points, cell, _reach(species[k], np.eye(points.shape[1], dtype=bool)))
         for array, values in zip(fit, _fit(points, species[k]), strict=True):
             array[members] = values
     return matched._replace(fit=fit)
@@ -158,8 +161,23 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     return [kind(*atom) for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)]
 
 
-def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None) -> list[list[int]]:
-    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees."""
+def _reach(molecule: Molecule, allowed: np.ndarray) -> np.ndarray:
+    """Largest lengths (s, s) of bonds between atoms, Å, of which `allowed` (s, s) says what site each may be. Bonds are
+    the shortest links of the template; other pairs of atoms have 0."""
+    points = molecule.positions_body[massive_sites(molecule)]
+    reach = np.zeros((len(points), len(points)))
+    for i, j in shortest_links(points):
+        pairs = np.outer(allowed[i], allowed[j])
+        longest = BOND_REACH * np.linalg.norm(points[i] - points[j])
+        reach = np.maximum(reach, longest * (pairs | pairs.T))
+    return reach
+
+
+def _bonded(
+    atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None
+) -> tuple[list[list[int]], set[int]]:
+    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees, and the
+    first atoms of groups without an end: bonded to their own images, as in polymers."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -174,14 +192,28 @@ def _bonded(atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.nd
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
     with_mass = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
     number = np.array([numbers[kinds[i]] for i in with_mass], int)
-    i, j, distance = pairs_within(atoms.position[with_mass], cell, reach.max())
-    i, j = np.array([i, j])[:, distance <= reach[number[i], number[j]]]
+    i, j, step = pairs_within(atoms.position[with_mass], cell, reach.max())
+    bonded = np.linalg.norm(step, axis=1) <= reach[number[i], number[j]]
+    i, j, step = i[bonded], j[bonded], step[bonded]
     shape = (len(with_mass), len(with_mass))
     count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
     runs = [[] for _ in range(count)]
     for atom, component in zip(with_mass, label, strict=True):
         runs[component].append(atom)
-    return sorted(runs)
+    endless = set() if cell is None else {runs[c][0] for c in _endless(label, i, j, step)}
+    return sorted(runs), endless
+
+
+def _endless(label: np.ndarray, i: np.ndarray, j: np.ndarray, step: np.ndarray) -> set[int]:
+    """Components (labels of atoms) whose bonds i, j with vectors step (b, 3) close a ring through the periodic cell."""
+    i, j, step = np.append(i, j), np.append(j, i), np.vstack([step, -step])
+    position, reached = np.zeros((len(label), 3)), np.zeros(len(label), bool)
+    reached[np.unique(label, return_index=True)[1]] = True
+    while len(onward := np.flatnonzero(reached[i] & ~reached[j])):
+        position[j[onward]] = position[i[onward]] + step[onward]
+        reached[j[onward]] = True
+    gap = np.linalg.norm(position[i] + step - position[j], axis=1)
+    return set(label[i[gap > SAME_PLACE * np.linalg.norm(step, axis=1)]].tolist())
 
 
 class _Candidate(NamedTuple):
@@ -194,9 +226,11 @@ class _Candidate(NamedTuple):
 
 
 def _match_groups(
-    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str
-) -> MatchedMolecules | list[str]:
-    """Each run of atoms as one molecule. Runs of one composition are fitted together. how : text for messages."""
+    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str,
+    endless: Collection[int] = ()
+) -> MatchedMolecules | list[str]:  # fmt: skip
+    """Each run of atoms as one molecule. Runs of one composition are fitted together. how : text for messages.
+    endless : first atoms of runs that are bonded to their own images."""
 
     def described(number: int) -> str:
         run = runs[number]
@@ -227,6 +261,10 @@ def _match_groups(
             listed = ", ".join(name or "(no name)" for name in names)
             by_shape = species[found.species[members[0]]].name
             found.notes.append(f"the names of atoms {listed} are not elements: assigned to {by_shape} by shape")
+    for number, run in enumerate(runs):
+        if run[0] in endless:
+            has = _formula(kinds[i].rstrip("?") for i in run)
+            faults[number] = f"({has}) is bonded to its own image in the next cell: it is no molecule, but a polymer"
     if faults:
         return [f"{described(m)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
@@ -302,8 +340,9 @@ def _fit_group(
         else:
             off = np.array([fit.deviation[row] for _, fit in fits])
             for k, c in enumerate(candidates if len(faults) < MOST_SEARCHED else ()):  # of the best order found
-                points = _make_whole(atoms.position[fits[k][0][row]][None], cell)
                 molecule, wide = species[c.species], SEARCH_TOLERANCE * limits[k]
+                points = atoms.position[fits[k][0][row]][None]
+                points = make_whole(points, cell, _reach(molecule, c.allowed[-1]))
                 if (best := _search_order(points[0], molecule, c.allowed[-1], wide, MOST_TRIES // 10)) is not None:
                     off[k] = min(off[k], _fit(points[:, best], molecule).deviation[0])
             k = int(np.argmin(off / limits))
@@ -318,7 +357,7 @@ def _fit_in_any_order(
     """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits. Each
     mask of `allowed`, see _Candidate, is tried where the ones before it give no fit."""
     limit = tolerance * molecule.radius
-    points = _make_whole(position[order], cell)
+    points = make_whole(position[order], cell, _reach(molecule, allowed[-1]))
     fit = _fit(points, molecule)
     for mask in allowed:
         bad = np.flatnonzero(fit.deviation > limit)
@@ -354,16 +393,6 @@ def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray
     wanted = sorted_distances(template[None])
     blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
     return np.concatenate([(np.abs(sorted_distances(b) - wanted) <= 2 * limit).all(axis=1) for b in blocks])
-
-
-def _make_whole(points: np.ndarray, cell: np.ndarray | None) -> np.ndarray:
-    """Molecules (m, s, 3) with every atom at the image nearest to the first atom."""
-    if cell is None or points.shape[1] == 1:
-        return points
-    from ase.geometry import find_mic
-
-    step, _ = find_mic((points - points[:, :1]).reshape(-1, 3), cell, pbc=True)
-    return points[:, :1] + step.reshape(points.shape)
 
 
 def _fit(points: np.ndarray, molecule: Molecule) -> TemplateFit:

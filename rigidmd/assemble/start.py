@@ -168,8 +168,8 @@ def close_pairs(
     near: dict[tuple[int, int], float] = {}
     for radius, sites_of in wanted:
         chosen = system.of_sites(lambda m, sites_of=sites_of: np.isin(every_site(m), sites_of(m))).nonzero()[0]
-        i, j, distance = pairs_within(position[chosen], cell, radius)
-        i, j = chosen[i], chosen[j]
+        i, j, step = pairs_within(position[chosen], cell, radius)
+        i, j, distance = chosen[i], chosen[j], np.linalg.norm(step, axis=1)
         kept = (owner[i] != owner[j]) & (free[owner[i]] | free[owner[j]])
         for *pair, length in zip(i[kept].tolist(), j[kept].tolist(), distance[kept].tolist(), strict=True):
             near[min(pair), max(pair)] = min(length, near.get((min(pair), max(pair)), inf))

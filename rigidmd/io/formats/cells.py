@@ -115,10 +115,59 @@ def cell_of(parameters: list[float]) -> np.ndarray | None:
     return None
 
 
+def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """The shortest images of vectors (n, 3) in any cell (3, 3)."""
+    from ase.geometry import minkowski_reduce
+
+    cell = np.asarray(minkowski_reduce(cell)[0])
+    inverse = np.linalg.inv(cell)
+    nearest = vectors - np.rint(vectors @ inverse) @ cell
+    thickness = 1 / np.linalg.norm(inverse, axis=0)
+    # of a shorter vector no other image is shorter; in a reduced cell the shortest image is next to the rounded one
+    far = np.flatnonzero(np.linalg.norm(nearest, axis=1) > 0.5 * thickness.min())
+    neighbours = np.array(list(product((0, -1, 1), repeat=3))) @ cell
+    images = nearest[far, None] + neighbours
+    shortest = np.linalg.norm(images, axis=2).argmin(axis=1)
+    nearest[far] = images[np.arange(len(far)), shortest]
+    return nearest
+
+
+def make_whole(points: np.ndarray, cell: np.ndarray | None, reach: np.ndarray) -> np.ndarray:
+    """Molecules (m, s, 3) without jumps across the faces of a cell (3, 3), if any. The first atoms keep their images.
+
+    Each molecule is walked from its first atom along bonds, to the nearest image at each of them, so that it may be
+    longer than the cell. reach (s, s): largest lengths of bonds between atoms, Å; 0 for atoms that are not bonded.
+    Atoms that no bond connects are joined to the nearest atoms (a minimum spanning tree by Prim's algorithm).
+    """
+    count, size, _ = points.shape
+    if cell is None or size == 1:
+        return points
+    whole, molecule = points.copy(), np.arange(count)
+    outside = np.ones((count, size), bool)
+    distance = np.full((count, size), np.inf)  # of an atom outside from the tree
+    newest = np.zeros(count, int)
+    for _ in range(size - 1):
+        outside[molecule, newest] = False
+        steps = points - points[molecule, newest][:, None]
+        steps = nearest_images(steps.reshape(-1, 3), cell).reshape(points.shape)
+        length, longest = np.linalg.norm(steps, axis=2), reach[newest]
+        bonded = length < longest
+        # bonds precede all other pairs, however short these are: hydrogen bonds to images of the same molecule
+        rank = np.where(bonded, length / np.where(bonded, longest, 1.0), 1.0 + length)
+        closer = outside & (rank < distance)
+        distance[closer] = rank[closer]
+        whole[closer] = (whole[molecule, newest][:, None] + steps)[closer]
+        if (distance[outside] <= 1.0).all():  # each is bonded to an atom of the tree
+            break
+        newest = np.where(outside, distance, np.inf).argmin(axis=1)
+    return whole
+
+
 def pairs_within(
     position: np.ndarray, cell: np.ndarray | None, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs i, j of points (n, 3) within a radius, with periodic images in any cell (3, 3), and their distances."""
+    """Pairs i, j of points (n, 3) within a radius, with periodic images in any cell (3, 3), and the vectors (p, 3)
+    from i to the image of j."""
     from scipy.spatial import KDTree
 
     points, owner = position, np.arange(len(position))
@@ -135,4 +184,4 @@ def pairs_within(
         owner, points = (np.concatenate(parts) for parts in zip(*images, strict=True))
         points = points @ cell
     i, j = KDTree(points).query_pairs(radius, output_type="ndarray").T
-    return owner[i], owner[j], np.linalg.norm(points[i] - points[j], axis=1)
+    return owner[i], owner[j], points[j] - points[i]
