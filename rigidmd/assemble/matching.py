@@ -162,7 +162,7 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
 
 
 def _reach(molecule: Molecule, allowed: np.ndarray) -> np.ndarray:
-    """Largest lengths (s, s) of bonds between atoms, Å, of which `allowed` (s, s) says what site each may be. Bonds are
+    """Largest lengths (s, s) of bonds between atoms, Å, given the sites that each may be, `allowed` (s, s). Bonds are
     the shortest links of the template; other pairs of atoms have 0."""
     points = molecule.positions_body[massive_sites(molecule)]
     reach = np.zeros((len(points), len(points)))
@@ -264,7 +264,7 @@ def _match_groups(
     for number, run in enumerate(runs):
         if run[0] in endless:
             has = _formula(kinds[i].rstrip("?") for i in run)
-            faults[number] = f"({has}) is bonded to its own image in the next cell: it is no molecule, but a polymer"
+            faults[number] = f"({has}) is bonded to its own image in the next cell: a polymer, not a molecule"
     if faults:
         return [f"{described(m)} {fault}" for m, fault in sorted(faults.items())]
     others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
