@@ -163,7 +163,7 @@ def test_control_characters_of_a_model_are_not_printed(capsys, tmp_path):
         ("x.gro", "\n6\n", f"\n{'9' * 5000}\n", "x.gro: line 2: expected the number of atoms, found '999"),
         ("x.gro", "\n6\n", "\n²\n", "x.gro: line 2: expected the number of atoms, found '²'"),
         ("x.data", "6 atoms", "100000000000 atoms", "x.data: line 3 promises 100000000000 atoms"),
-        ("x.cif", "1.0\n", "?\n", "x.cif: some of its sites have the occupancy ?"),
+        ("x.cif", "1.0\n", "full\n", "x.cif: some of its sites have the occupancy full"),
         ("x.xyz", "O 2.0 ", "O 1e200 ", "x.xyz: an atom is at 1e+200 Å, farther than 1e+09 Å"),
         ("y.xyz", '"18.0', '"0.1', "y.xyz: its box: with its edges of 0.1, 18, 18 Å it is 0.1 Å thick"),
         ("x.gro", "   OW", "\x1b[31m", "x.gro: atom 1 has a name with control characters"),

@@ -152,6 +152,7 @@ def _read_molecules(
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
         faults = _unknown_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
+        faults += [f"as read: {note}" for note in atoms.notes]
         raise StructureError(str(path), faults)
     if len(matched.species) == 0:
         raise StructureError(str(path), ["has no atoms with mass"])

@@ -17,7 +17,7 @@ CHARMM_IONS = {"SOD": "Na", "POT": "K", "CES": "Cs", "CLA": "Cl", "LIT": "Li", "
 #: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like oxygen.
 CHARMM_WATER = ("OH2", "OM")
 #: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs give them.
-MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM|VS|XX?|Q)\d*", re.IGNORECASE)
+MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM?|VS|XX?|Q)\d*", re.IGNORECASE)
 
 
 class Atoms(NamedTuple):
