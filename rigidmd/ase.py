@@ -18,8 +18,9 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
+from rigidmd.assemble.assignment import massive_sites
 from rigidmd.assemble.build import build
-from rigidmd.assemble.matching import MatchedMolecules, massive_sites, match, refit
+from rigidmd.assemble.matching import MatchedMolecules, match, refit
 from rigidmd.assemble.scenes import SOURCE, atoms_errors, scene_from_atoms
 from rigidmd.assemble.species import species_of
 from rigidmd.assemble.user_code.force import Force, UserForceError

@@ -488,6 +488,104 @@ def test_the_deviation_of_sites_that_share_names_is_that_of_their_best_order(tmp
         read(tmp_path, text, "a.gro", truth.species[:1])
 
 
+def united_propene(names=("CH3", "CH", "CH2"), **values) -> Molecule:
+    """CH3-CH=CH2 of united atoms, three of one element, whose ends differ by 0.2 Å. values: of the second end"""
+    angle = np.radians(124.0)
+    places = ((1.54, 0.0, 0.0), (0.0, 0.0, 0.0), (1.33 * float(np.cos(angle)), 1.33 * float(np.sin(angle)), 0.0))
+    epsilons = (98.0, 47.0, values.pop("epsilon_K", 85.0))
+    masses = (15.035, 13.019, values.pop("mass_u", 14.027))
+    sites = [
+        Site(name=name, element="C", mass_u=m, position_A=x, sigma_A=3.7, epsilon_K=e)
+        for name, m, x, e in zip(names, masses, values.pop("places", places), epsilons, strict=True)
+    ]
+    return molecule("propene", tuple(sites), residue_names=("PPE",))
+
+
+@pytest.mark.parametrize("names", [("CH3", "CH", "CH2"), ("C", "C", "C")])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2), (1, 2, 0)])
+@pytest.mark.parametrize("digits", [10, 3])
+def test_the_best_order_is_taken(names, order, digits, tmp_path):
+    """In all orders of the atoms the molecules are the same, in the digits of a .gro too."""
+    kind = united_propene(names)
+    truth = Truth([kind] * 6, 31)
+    atoms = truth.atoms()
+    atoms = [
+        ("C", "C", k, x.round(digits), v)
+        for first in range(0, 18, 3)
+        for i in order
+        for _, _, k, x, v in [atoms[first + i]]
+    ]
+    found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
+    partner = same_molecules(found, truth, [kind], 2 * 10.0**-digits)
+    ends = found.position[:, None] + np.einsum("nij,sj->nsi", found.rotation, kind.positions_body)
+    there = truth.centre[:, None] + np.einsum("nij,sj->nsi", truth.rotation, kind.positions_body)
+    assert np.abs(ends - there[partner]).max() < 5 * 10.0**-digits  # each site at its own place
+    assert found.notes == ()
+
+
+def test_orders_are_the_best_of_all(tmp_path):
+    """Molecules that are bent, in random orders of the atoms: no order of those of one element fits better."""
+    from itertools import permutations, product
+
+    rng = np.random.default_rng(5)
+    for name in ("CH3CH2OH", "C3H4_C2v", "CH3NO2", "NH3", "CH4", "C4H4O"):
+        known = ase.build.molecule(name)
+        columns = zip(known.symbols, known.get_masses().tolist(), known.positions.tolist(), strict=True)
+        kind = molecule(name, tuple(Site(name=e, element=e, mass_u=m, position_A=tuple(x)) for e, m, x in columns))
+        elements = np.array(kind.elements)
+        parts = [np.flatnonzero(elements == e) for e in dict.fromkeys(kind.elements)]
+        for width in (0.02, 0.04):
+            truth = Truth([kind], int(rng.integers(1000)))
+            atoms = [(n, e, k, x + width * rng.standard_normal(3), v) for n, e, k, x, v in truth.atoms()]
+            rng.shuffle(atoms)
+            points = np.array([x for *_, x, _ in sorted(atoms, key=lambda atom: kind.elements.index(atom[1]))])
+            least = np.inf
+            template = np.concatenate(parts)
+            body, masses = kind.positions_body[template], kind.masses[template]
+            for orders in product(*(permutations(range(len(part))) for part in parts)):
+                first = np.cumsum([0, *(len(part) for part in parts)])
+                order = np.concatenate([f + np.array(o) for f, o in zip(first[:-1], orders, strict=True)])
+                at = points[order] - masses @ points[order] / masses.sum()
+                u, _, vt = np.linalg.svd((masses[:, None] * at).T @ body)
+                u[:, 2] *= np.linalg.det(u @ vt)
+                least = min(least, np.sqrt(((at - body @ (u @ vt).T) ** 2).sum(axis=1).mean()))
+            found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
+            assert found.residual_rms <= 1.2 * least + 1e-4 * kind.radius, (name, width)
+
+
+def test_orders_that_fit_equally_well_are_named(tmp_path):
+    """Ends of one distance: where their parameters differ, the file decides by its order, and a note names it."""
+    places = ((1.4, 0.0, 0.0), (0.0, 0.0, 0.0), (-0.7, 1.4 * np.sqrt(0.75), 0.0))
+    for values, noted in (({"epsilon_K": 98.0, "mass_u": 15.035}, False), ({"mass_u": 15.035}, True)):
+        kind = united_propene(("A", "B", "C"), places=places, **values)
+        truth = Truth([kind] * 4, 32)
+        for order in ((0, 1, 2), (2, 1, 0)):
+            atoms = truth.atoms()
+            atoms = [("C", "C", *atoms[first + i][2:]) for first in range(0, 12, 3) for i in order]
+            found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
+            assert found.residual_max < 1e-6
+            ends = found.position + found.rotation @ kind.positions_body[0]
+            assert ends == pytest.approx(np.array([x for *_, x, _ in atoms[::3]]), abs=1e-6) or not noted
+            wanted = "4 molecules of propene: two orders of its atoms, in which different sites are exchanged"
+            assert any(note.startswith(wanted) for note in found.notes) == noted
+    named = [(n, "C", k, x, v) for n, _, k, x, v in truth.atoms()]
+    text = gro(named, box_of(truth.cell), 6, residue_names=dict.fromkeys(range(4), "PPE"))
+    assert read(tmp_path, text, "a.gro", [kind]).notes == ()  # names decide
+
+
+def test_names_that_fit_less_well_than_elements_are_noted(tmp_path):
+    """Another program has numbered the atoms in the other direction."""
+    kind = united_propene(("C1", "C2", "C3"))
+    truth = Truth([kind] * 4, 33)
+    atoms = [({"C1": "C3", "C2": "C2", "C3": "C1"}[n], e, k, x, v) for n, e, k, x, v in truth.atoms()]
+    text = gro(atoms, box_of(truth.cell), 6, residue_names=dict.fromkeys(range(4), "PPE"))
+    found = read(tmp_path, text, "a.gro", [kind])
+    assert any(
+        re.search(r"fits propene with 0\.1\d\d Å .rms., and another order of atoms with 0\.000 Å", n)
+        for n in found.notes
+    )
+
+
 # a property: nothing that leaves the molecules what they are changes what is read
 
 
@@ -701,9 +799,31 @@ def test_a_mirror_image_is_another_molecule(tmp_path):
     truth = Truth(["chiral"] * 4, 7)
     mirrored = [(name, e, k, x * [-1, 1, 1], v) for name, e, k, x, v in truth.atoms()]
     with pytest.raises(
-        StructureError, match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is not halothane: an atom is"
+        StructureError,
+        match=r"molecule 1 \(atoms 1 to 5, by bonding distance\) is not halothane: an atom is .* mirror image of halothane",
     ):
         read(tmp_path, xyz(mirrored, truth.cell), "a.xyz", ["chiral"])
+    image = dataclasses.replace(
+        SPECIES["chiral"], name="other_hand", positions_body=SPECIES["chiral"].positions_body * [-1, 1, 1]
+    )
+    found = read(tmp_path, xyz(mirrored[:5] + truth.atoms()[5:], truth.cell), "a.xyz", ["chiral", image])
+    assert found.species.tolist() == [1, 0, 0, 0]
+
+
+def test_a_mirror_image_within_the_tolerance_is_noted(tmp_path):
+    """A molecule that is hardly chiral: half of a racemic crystal fits, and less well than its mirror image does."""
+    sites = [Site(name=e, element=e, mass_u=m, position_A=x) for e, m, x in (
+        ("C", 12.0, (0.0, 0.0, 0.0)), ("O", 16.0, (1.5, 0.0, 0.0)), ("N", 14.0, (-0.5, 1.4, 0.0)), ("F", 19.0, (-0.5, -1.4, 0.25)),
+    )]  # fmt: skip
+    kind = molecule("nearly_flat", tuple(sites))
+    truth = Truth([kind] * 4, 34)
+    atoms = [(n, e, k, x * ([-1, 1, 1] if k == 2 else 1), v) for n, e, k, x, v in truth.atoms()]
+    found = read(tmp_path, xyz(atoms, truth.cell), "a.xyz", [kind])
+    assert found.residual_max > 0.05
+    assert any(
+        re.search(r"fits nearly_flat with 0\.\d+ Å .rms., and its mirror image with 0\.000 Å", n) for n in found.notes
+    )
+    assert read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz", [kind]).notes == ()
 
 
 def test_hydrogen_bonds_are_none_of_the_bonds_of_larger_atoms(tmp_path):
@@ -1702,12 +1822,31 @@ def test_species_that_the_scene_lacks(tmp_path):
         read(tmp_path, text, "a.gro")
 
 
-def test_like_species_need_residue_names(tmp_path):
-    truth = Truth(["spce"] * 3, 18)
-    with pytest.raises(
-        StructureError, match=r"molecule 1 .atoms 1 to 3, .* may be spce or tip4p2005: give them residue_names"
-    ):
-        read(tmp_path, xyz(truth.atoms(), truth.cell), "a.xyz", ["spce", "tip4p2005"])
+@pytest.mark.parametrize("file_model", ["spce", "tip4p2005"])
+def test_of_two_species_the_one_that_fits_is_taken(file_model, tmp_path):
+    """Both fit within the tolerance; the massless site is not in the file."""
+    truth = Truth([file_model] * 3, 18)
+    text = xyz(truth.atoms(massless=False), truth.cell)
+    found = read(tmp_path, text, "a.xyz", ["spce", "tip4p2005"])
+    same_molecules(found, truth, [SPECIES["spce"], SPECIES["tip4p2005"]], 1e-6)
+    other = {"spce": "tip4p2005", "tip4p2005": "spce"}[file_model]
+    assert f"3 molecules taken for {file_model} and not {other}, which fits less well" in found.notes
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.03])
+def test_like_species_need_residue_names(stretch, tmp_path):
+    """Two models of one geometry, and a geometry between those of two models."""
+    other = dataclasses.replace(SPECIES["tip4p2005"], name="tip4p_ice", residue_names=())
+    species = [SPECIES["tip4p2005"], other] if stretch == 1.0 else [SPECIES["spce"], SPECIES["tip4p2005"]]
+    truth = Truth(["tip4p2005"] * 3, 18)
+    atoms = truth.atoms(massless=False)
+    if stretch != 1.0:
+        means = [0.5 * (a + b) for a, b in zip(*(m.positions_body[:3] for m in species), strict=True)]
+        atoms = [
+            (n, e, k, truth.centre[k] + truth.rotation[k] @ means[i % 3], v) for i, (n, e, k, _, v) in enumerate(atoms)
+        ]
+    with pytest.raises(StructureError, match=r"molecule 1 .atoms 1 to 3, .* may be .* or .*: give them residue_names"):
+        read(tmp_path, xyz(atoms, truth.cell), "a.xyz", species)
 
 
 def test_nothing_is_printed_or_warned(tmp_path, capsys, recwarn):

@@ -1,42 +1,40 @@
 """Assigns the atoms of a file to molecules, by residues or else by bonding distance, and fits rigid templates."""
 
 from collections import Counter, deque
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Collection
 from functools import cache
 from itertools import groupby
-from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.assignment import (
+    BOND_REACH,
+    EQUAL_OF_RADIUS,
+    Assignment,
+    Orders,
+    TemplateFit,
+    bond_reach,
+    fit_template,
+    massive_sites,
+    numbered,
+)
 from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
 from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.io.formats.cells import make_whole, pairs_within
-from rigidmd.mechanics.rotation import align
 from rigidmd.scene.models import Molecule
 
-#: Atoms are bonded up to this multiple of the template's longest bond between atoms of the same labels. Hydrogen bonds
-#: of water are at least 1.6 times as long as its bonds.
-BOND_REACH = 1.25
 #: Two ways along bonds that end this close, relative to a bond, end at the same image of an atom.
 SAME_PLACE = 1e-3
-#: Partial assignments tried before the search for an order of atoms gives up.
-MOST_TRIES = 20_000
-MOST_DISTANCES = 1_000_000  # computed at once
 #: u; programs without massless sites give them a mass below this.
 NO_MASS = 0.1
 #: Up to this multiple of the tolerance the best order of atoms is searched, for messages on molecules that do not fit.
-MOST_SEARCHED, SEARCH_TOLERANCE = 5, 3
+SEARCH_TOLERANCE = 3
+MOST_SEARCHED = 5  # of these molecules
 MOST_LISTED = 6  # atoms of a molecule in a message
-
-
-class TemplateFit(NamedTuple):
-    """Rigid templates fitted to m molecules of s sites with mass."""
-
-    centre: np.ndarray  # (m, 3) Å
-    rotation: np.ndarray  # (m, 3, 3)
-    deviation: np.ndarray  # (m,) largest distance of an atom from the template, Å
-    square: np.ndarray  # (m,) mean square of these distances, Å²
+#: Of two species, mirror images or ways to assign atoms one is better if its rms deviation is less than this fraction
+#: of the other. Fits closer than this fraction of the radius are not compared.
+CLEARLY_BETTER, CLOSE_FIT = 0.5, 0.02
 
 
 class MatchedMolecules(NamedTuple):
@@ -50,24 +48,20 @@ class MatchedMolecules(NamedTuple):
     number: np.ndarray | None = None  # (n,) residue numbers, if residues are molecules and numbered
 
 
-def massive_sites(molecule: Molecule) -> np.ndarray:
-    """Indices of the sites of a molecule that have mass, and so are atoms."""
-    return np.flatnonzero(molecule.masses > 0)
-
-
 def match(
     atoms: Atoms, species: list[Molecule], cell: np.ndarray | None, tolerance: float
 ) -> MatchedMolecules | list[str]:
     """The molecules that the atoms form, or error messages. The cell (3, 3), if any, has faces across which molecules
     may be split; tolerance: see Scene.structure."""
     kinds = _kinds(atoms, species)
+    matcher = _Matcher(atoms, kinds, species, cell, tolerance)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
-    by_residue = _match_groups(atoms, kinds, runs, species, cell, tolerance, "") if atoms.residue[0] else []
+    by_residue = matcher.match(runs, "") if atoms.residue[0] else []
     if isinstance(by_residue, MatchedMolecules):
         numbers = [atoms.residue[run[0]][0] for run in runs]
         return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
     runs_by_bonds, endless = _bonded(atoms, kinds, species, cell)
-    by_bonds = _match_groups(atoms, kinds, runs_by_bonds, species, cell, tolerance, ", by bonding distance", endless)
+    by_bonds = matcher.match(runs_by_bonds, ", by bonding distance", endless)
     if isinstance(by_bonds, MatchedMolecules):
         note = "its residues are not the molecules of the scene, which were found by bonding distance"
         by_bonds.notes.extend([note] if by_residue else [])
@@ -90,8 +84,9 @@ def refit(
     for k in np.unique(matched.species):
         members = np.flatnonzero(matched.species == k)
         points = position[np.array([matched.atoms[m] for m in members])]
-        points = make_whole(points, cell, _reach(species[k], np.eye(points.shape[1], dtype=bool)))
-        for array, values in zip(fit, _fit(points, species[k]), strict=True):
+        template = species[k].positions_body[massive_sites(species[k])]
+        points = make_whole(points, cell, bond_reach(template, np.arange(len(template))))
+        for array, values in zip(fit, fit_template(points, species[k]), strict=True):
             array[members] = values
     return matched._replace(fit=fit)
 
@@ -161,18 +156,6 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
     return [kind(*atom) for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)]
 
 
-def _reach(molecule: Molecule, allowed: np.ndarray) -> np.ndarray:
-    """Largest lengths (s, s) of bonds between atoms, Å, given the sites that each may be, `allowed` (s, s). Bonds are
-    the shortest links of the template; other pairs of atoms have 0."""
-    points = molecule.positions_body[massive_sites(molecule)]
-    reach = np.zeros((len(points), len(points)))
-    for i, j in shortest_links(points):
-        pairs = np.outer(allowed[i], allowed[j])
-        longest = BOND_REACH * np.linalg.norm(points[i] - points[j])
-        reach = np.maximum(reach, longest * (pairs | pairs.T))
-    return reach
-
-
 def _bonded(
     atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None
 ) -> tuple[list[list[int]], set[int]]:
@@ -221,55 +204,192 @@ class _Candidate(NamedTuple):
 
     species: int
     order: list[int]  # atoms of the group, in the order of the sites with mass
-    allowed: list[np.ndarray]  # (s, s) whether a site may be each atom of this order: by names, then by elements
+    classes: list[np.ndarray]  # (s,) atoms of one class may be exchanged: by names, then by elements
     nameless: bool
 
 
-def _match_groups(
-    atoms: Atoms, kinds: list[str], runs: list[list[int]], species: list[Molecule], cell, tolerance: float, how: str,
-    endless: Collection[int] = ()
-) -> MatchedMolecules | list[str]:  # fmt: skip
-    """Each run of atoms as one molecule. Runs of one composition are fitted together. how : text for messages.
-    endless : first atoms of runs that are bonded to their own images."""
+class _Group(NamedTuple):
+    """Runs of atoms of the same names and kinds as one species."""
 
-    def described(number: int) -> str:
-        run = runs[number]
+    candidate: _Candidate
+    points: np.ndarray  # (m, s, 3) whole molecules, sites in the order of the candidate
+    order: np.ndarray  # (m, s) atoms of the file, alike
+    assigned: Assignment
+    limit: float  # largest deviation, Å
+
+    @property
+    def fits(self) -> np.ndarray:
+        """Whether each molecule fits (m,)."""
+        return (self.assigned.fit.deviation <= self.limit) | (self.order.shape[1] == 1)
+
+
+class _Matcher:
+    """Matches runs of atoms to species."""
+
+    def __init__(
+        self, atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None, tolerance: float
+    ):
+        self._atoms, self._kinds, self._species = atoms, kinds, species
+        self._cell, self._tolerance = cell, tolerance
+        self._orders: dict[tuple, Orders] = {}
+
+    def match(self, runs: list[list[int]], how: str, endless: Collection[int] = ()) -> MatchedMolecules | list[str]:
+        """Each run of atoms as one molecule. Runs of one composition are fitted together.
+
+        how : text for messages
+        endless : first atoms of runs that are bonded to their own images
+        """
+        atoms, kinds, n = self._atoms, self._kinds, len(runs)
+        alike: dict[tuple, list[int]] = {}
+        for number, run in enumerate(runs):
+            residue = atoms.residue[run[0]]
+            names = tuple(atoms.names[i] for i in run)
+            key = (residue[1] if residue else "", names, tuple(kinds[i] for i in run))
+            alike.setdefault(key, []).append(number)
+        fit = TemplateFit(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n))
+        found = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, Counter(), notes=[])
+        faults: dict[int, str] = {}
+        notes: Counter[str] = Counter()
+        for (residue, names, run_kinds), members in alike.items():
+            groups = self._groups(residue, names, run_kinds, np.array([runs[m] for m in members]))
+            if isinstance(groups, str):
+                faults |= dict.fromkeys(members, groups)
+                continue
+            faults |= self._choose(groups, members, found, notes, len(faults))
+            if any(group.candidate.nameless for group in groups) and not faults:
+                listed = ", ".join(name or "(no name)" for name in names)
+                by_shape = self._species[found.species[members[0]]].name
+                notes[f"the names of atoms {listed} are not elements: assigned to {by_shape} by shape"] += 1
+        for number, run in enumerate(runs):
+            if run[0] in endless:
+                has = _formula(kinds[i].rstrip("?") for i in run)
+                image = f"({has}) is bonded to its own image in the next cell"
+                faults[number] = f"{image}: a polymer, not a molecule"
+        if faults:
+            return [f"{self._described(m, runs[m], how)} {fault}" for m, fault in sorted(faults.items())]
+        others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
+        found.massless.update(atoms.names[i] for i in others)
+        found.notes.extend(note.replace(COUNT, f"{count} molecule{'s' * (count > 1)}") for note, count in notes.items())
+        return found
+
+    def _described(self, number: int, run: list[int], how: str) -> str:
         listed = ", ".join(str(i + 1) for i in run[:MOST_LISTED]) + (", ..." if len(run) > MOST_LISTED else "")
         if run == list(range(run[0], run[-1] + 1)):
             listed = f"{run[0] + 1} to {run[-1] + 1}" if len(run) > 1 else f"{run[0] + 1}"
-        residue = f", residue {atoms.residue[run[0]][1]!r}" if "".join(atoms.residue[run[0]][1:2]) else ""
-        return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{residue}{how})"
+        residue = self._atoms.residue[run[0]]
+        named = f", residue {residue[1]!r}" if "".join(residue[1:2]) else ""
+        return f"molecule {number + 1} (atom{'s' * (len(run) > 1)} {listed}{named}{how})"
 
-    alike, faults, n = {}, {}, len(runs)
-    for number, run in enumerate(runs):
-        residue = atoms.residue[run[0]]
-        key = (residue[1] if residue else "", tuple(atoms.names[i] for i in run), tuple(kinds[i] for i in run))
-        alike.setdefault(key, []).append(number)
-    fit = TemplateFit(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n), np.zeros(n))
-    found = MatchedMolecules(np.full(n, -1), [np.zeros(0, int)] * n, fit, massless=Counter(), notes=[])
-    for (residue, names, run_kinds), members in alike.items():
-        named = [k for k, molecule in enumerate(species) if residue and residue in molecule.residue_names]
-        eligible = named or list(range(len(species)))
-        candidates = [c for k in eligible if (c := _candidate(names, run_kinds, species[k], k))]
+    def _groups(self, residue: str, names: tuple, kinds: tuple, runs: np.ndarray) -> list[_Group] | str:
+        """Runs (m, a) of atoms as molecules of each species that they may be, or why they are none."""
+        named = [k for k, m in enumerate(self._species) if residue and residue in m.residue_names]
+        eligible = named or list(range(len(self._species)))
+        candidates = [c for k in eligible if (c := _candidate(names, kinds, self._species[k], k))]
         if not candidates:
-            has = _formula(kind.rstrip("?") for kind in run_kinds)
-            wanted = " or ".join(f"{species[k].name} ({_composition(species[k])})" for k in eligible)
-            faults |= {m: f"has atoms {has}, expected {wanted}" for m in members}
-            continue
-        _fit_group(atoms, [runs[m] for m in members], members, candidates, species, cell, tolerance, found, faults)
-        if any(c.nameless for c in candidates) and not faults:
-            listed = ", ".join(name or "(no name)" for name in names)
-            by_shape = species[found.species[members[0]]].name
-            found.notes.append(f"the names of atoms {listed} are not elements: assigned to {by_shape} by shape")
-    for number, run in enumerate(runs):
-        if run[0] in endless:
-            has = _formula(kinds[i].rstrip("?") for i in run)
-            faults[number] = f"({has}) is bonded to its own image in the next cell: a polymer, not a molecule"
-    if faults:
-        return [f"{described(m)} {fault}" for m, fault in sorted(faults.items())]
-    others = np.delete(np.arange(len(kinds)), np.concatenate([np.zeros(0, int), *found.atoms]))
-    found.massless.update(atoms.names[i] for i in others)
-    return found
+            wanted = " or ".join(f"{self._species[k].name} ({_composition(self._species[k])})" for k in eligible)
+            return f"has atoms {_formula(kind.rstrip('?') for kind in kinds)}, expected {wanted}"
+        return [self._assigned(c, runs[:, c.order]) for c in candidates]
+
+    def _assigned(self, candidate: _Candidate, order: np.ndarray) -> _Group:
+        """The best order of atoms (m, s) by names, and for molecules that do not fit so, by elements."""
+        by_names, by_elements = (self._orders_of(candidate.species, classes) for classes in candidate.classes)
+        points = make_whole(self._atoms.position[order], self._cell, by_elements.reach)
+        assigned = by_names.best(points)
+        if by_elements is not by_names:
+            bad = np.flatnonzero(assigned.fit.deviation > by_names.limit)
+            other = by_elements.best(points[bad])
+            assigned = assigned.with_better(bad, other, by_names.limit)
+        order = np.take_along_axis(order, assigned.order, axis=1)
+        return _Group(candidate, points, order, assigned, by_names.limit)
+
+    def _orders_of(self, species: int, classes: np.ndarray) -> Orders:
+        key = (species, *classes.tolist())
+        if key not in self._orders:
+            molecule = self._species[species]
+            self._orders[key] = Orders(molecule, classes, self._tolerance * molecule.radius)
+        return self._orders[key]
+
+    def _choose(
+        self, groups: list[_Group], members: list[int], found: MatchedMolecules, notes: Counter[str], known: int
+    ) -> dict[int, str]:
+        """Write the species of molecules `members`, of which `groups` are the possible ones, into `found`. Returns
+        error messages by molecule; `known` is the number of those found before."""
+        faults = {}
+        rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])  # (groups, m)
+        chosen, fitting = rms.argmin(axis=0), np.isfinite(rms)
+        clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
+        least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance
+        doubtful = (fitting.sum(axis=0) > 1) & (least >= CLEARLY_BETTER * clear)
+        for row, m in enumerate(members):
+            if doubtful[row]:
+                names = " or ".join(self._name(g) for g, fits in zip(groups, fitting[:, row], strict=True) if fits)
+                faults[m] = f"may be {names}: give them residue_names in the scene"
+            elif not fitting[:, row].any():
+                faults[m] = self._misfit(groups, row, search=known + len(faults) < MOST_SEARCHED)
+            else:
+                group = groups[chosen[row]]
+                found.species[m], found.atoms[m] = group.candidate.species, group.order[row]
+                for array, values in zip(found.fit, group.assigned.fit, strict=True):
+                    array[m] = values[row]
+        if not faults:
+            for k, group in enumerate(groups):
+                self._note(group, chosen == k, rms, notes, [self._name(other) for other in groups])
+        return faults
+
+    def _name(self, group: _Group) -> str:
+        return self._species[group.candidate.species].name
+
+    def _misfit(self, groups: list[_Group], row: int, search: bool) -> str:
+        """Why a molecule fits no species. search : whether for better orders, beyond the limit"""
+        off = np.array([group.assigned.fit.deviation[row] for group in groups])
+        mirrored = []
+        for k, group in enumerate(groups if search else ()):
+            orders = self._orders_of(group.candidate.species, group.candidate.classes[-1])
+            points = group.points[row]
+            if (best := orders.search(points, SEARCH_TOLERANCE * group.limit)) is not None:
+                off[k] = min(off[k], fit_template(points[None, best], orders.molecule).deviation[0])
+            if orders.search(MIRROR * points, group.limit) is not None:
+                mirrored.append(self._name(group))
+        k = int(np.argmin(off / [group.limit for group in groups]))
+        limit = f"more than {groups[k].limit:.3f} Å (structure.tolerance)"
+        message = f"is not {self._name(groups[k])}: an atom is {off[k]:.3f} Å from the rigid template, {limit}"
+        if mirrored:
+            advice = "a mirror image is another rigid molecule: add a species with mirrored positions"
+            message += f". It is the mirror image of {mirrored[0]}; {advice}"
+        return message
+
+    def _note(self, group: _Group, rows: np.ndarray, rms: np.ndarray, notes: Counter[str], names: list[str]) -> None:
+        """Add notes on the molecules `rows` of a group: what else fits them. rms (groups, m), Å, as each of `names`"""
+        name, fit, count = self._name(group), group.assigned.fit, int(rows.sum())
+        if not count:
+            return
+        orders = self._orders_of(group.candidate.species, group.candidate.classes[-1])
+        others = [other for other, fits in zip(names, np.isfinite(rms[:, rows]).any(axis=1), strict=True) if fits]
+        if len(others) > 1:
+            best = " and not ".join([name, *(other for other in others if other != name)])
+            notes[f"{COUNT} taken for {best}, which fits less well"] += count
+        if equal := int((group.assigned.rival[rows] <= orders.equal_to(fit.rms[rows])).sum()):
+            advice = "name the atoms in the file as the sites of the model"
+            what = "two orders of its atoms, in which different sites are exchanged, fit equally well"
+            notes[f"{COUNT} of {name}: {what}: the order of the file decides; {advice}"] += equal
+        worst = np.flatnonzero(rows)[fit.rms[rows].argmax()]
+        least = fit.rms[worst]
+        if least <= CLOSE_FIT * orders.molecule.radius:
+            return
+        points = group.points[worst]
+        for what, other_points in (("its mirror image", MIRROR * points), ("another order of atoms", points)):
+            order = orders.search(other_points, group.limit)
+            if order is None:
+                continue
+            other = fit_template(other_points[None, order], orders.molecule).rms[0]
+            if other < CLEARLY_BETTER * least:
+                notes[f"a molecule fits {name} with {least:.3f} Å (rms), and {what} with {other:.3f} Å"] += 1
+
+
+#: Stands for "3 molecules" in notes.
+COUNT = "{count}"
+#: Factors on coordinates of a mirror image.
+MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 def _formula(elements) -> str:
@@ -288,7 +408,8 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
         # as in the files of a run, also if several sites have the same name
-        return _Candidate(k, sites.tolist(), [np.eye(len(sites), dtype=bool), _same(labels[s] for s in sites)], False)
+        by_names = numbered(molecule.site_names[s] for s in sites)
+        return _Candidate(k, sites.tolist(), [by_names, numbered(labels[s] for s in sites)], nameless=False)
     indices = [i for i, kind in enumerate(kinds) if kind != "X"]
     if len(indices) > len(sites):
         massless = {name for name, mass in zip(molecule.site_names, molecule.masses, strict=True) if mass == 0}
@@ -296,7 +417,8 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     if len(indices) != len(sites):
         return None
     if len(indices) > 1 and all(kinds[i].endswith("?") for i in indices):
-        return _Candidate(k, indices, [np.ones((len(sites), len(sites)), bool)], nameless=True)
+        alike = np.zeros(len(sites), int)
+        return _Candidate(k, indices, [alike, alike], nameless=True)
     present = [(names[i], kinds[i]) for i in indices]
     if Counter(kind for _, kind in present) != Counter(label for _, label in wanted):
         return None
@@ -307,136 +429,5 @@ def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candi
     for index, key in zip(indices, group, strict=True):
         queues[key].append(index)
     order = [queues[key].popleft() for key in group_wanted]
-    return _Candidate(k, order, [_same(group_wanted), _same(label for _, label in wanted)], nameless=False)
-
-
-def _same(keys: Iterable[Hashable]) -> np.ndarray:
-    """Mask (n, n) of equal keys."""
-    numbers: dict[Hashable, int] = {}
-    number = np.array([numbers.setdefault(key, len(numbers)) for key in keys])
-    return number[:, None] == number
-
-
-def _fit_group(
-    atoms, runs, members, candidates, species, cell, tolerance, found: MatchedMolecules, faults: dict
-) -> None:
-    """Fit runs of one composition to their candidates; write into `found` or `faults`."""
-    fits = []
-    for c in candidates:
-        order = np.array(runs)[:, c.order]
-        fits.append((order, _fit_in_any_order(atoms.position, order, species[c.species], cell, c.allowed, tolerance)))
-    for row, m in enumerate(members):
-        limits = [tolerance * species[c.species].radius for c in candidates]
-        fitting = [k for k, (_, fit) in enumerate(fits) if len(fits[k][0][row]) == 1 or fit.deviation[row] <= limits[k]]
-        if len(fitting) == 1:
-            order, fit = fits[fitting[0]]
-            found.species[m] = candidates[fitting[0]].species
-            found.atoms[m] = order[row]
-            for array, values in zip(found.fit, fit, strict=True):
-                array[m] = values[row]
-        elif fitting:
-            names = " or ".join(species[candidates[k].species].name for k in fitting)
-            faults[m] = f"may be {names}: give them residue_names in the scene"
-        else:
-            off = np.array([fit.deviation[row] for _, fit in fits])
-            for k, c in enumerate(candidates if len(faults) < MOST_SEARCHED else ()):  # of the best order found
-                molecule, wide = species[c.species], SEARCH_TOLERANCE * limits[k]
-                points = atoms.position[fits[k][0][row]][None]
-                points = make_whole(points, cell, _reach(molecule, c.allowed[-1]))
-                if (best := _search_order(points[0], molecule, c.allowed[-1], wide, MOST_TRIES // 10)) is not None:
-                    off[k] = min(off[k], _fit(points[:, best], molecule).deviation[0])
-            k = int(np.argmin(off / limits))
-            limit = f"more than {limits[k]:.3f} Å (structure.tolerance)"
-            name = species[candidates[k].species].name
-            faults[m] = f"is not {name}: an atom is {off[k]:.3f} Å from the rigid template, {limit}"
-
-
-def _fit_in_any_order(
-    position: np.ndarray, order: np.ndarray, molecule: Molecule, cell, allowed: list[np.ndarray], tolerance: float
-) -> TemplateFit:
-    """The fit of molecules to their atoms `order` (m, s), which is corrected in place where another order fits. Each
-    mask of `allowed`, see _Candidate, is tried where the ones before it give no fit."""
-    limit = tolerance * molecule.radius
-    points = make_whole(position[order], cell, _reach(molecule, allowed[-1]))
-    fit = _fit(points, molecule)
-    for mask in allowed:
-        bad = np.flatnonzero(fit.deviation > limit)
-        if len(bad) and mask.sum() > len(mask):
-            bad = bad[_distances_agree(points[bad], molecule, mask, limit)]
-            while len(bad):
-                better = _search_order(points[bad[0]], molecule, mask, limit)
-                if better is None:
-                    bad = bad[1:]
-                    continue
-                new_fit = _fit(points[bad][:, better], molecule)  # files are regular: this order fits most others
-                fits = new_fit.deviation <= limit
-                for old, new in zip(fit, new_fit, strict=True):
-                    old[bad[fits]] = new[fits]
-                order[bad[fits]] = order[bad[fits]][:, better]
-                fits[0] = True  # even if rounding puts it just above the limit
-                bad = bad[~fits]
-    return fit
-
-
-def _distances_agree(points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float) -> np.ndarray:
-    """Which molecules (m, s, 3) have the same sorted distances between two kinds of atoms as the template, within twice
-    the limit, as every molecule that fits does."""
-    template = molecule.positions_body[massive_sites(molecule)]
-    i, j = np.triu_indices(len(template), 1)
-    kind = allowed.argmax(axis=1)
-    pair = np.minimum(kind[i], kind[j]) * len(kind) + np.maximum(kind[i], kind[j])
-
-    def sorted_distances(points: np.ndarray) -> np.ndarray:
-        distance = np.linalg.norm(points[:, i] - points[:, j], axis=2)
-        return np.take_along_axis(distance, np.lexsort((distance, np.broadcast_to(pair, distance.shape)), axis=1), 1)
-
-    wanted = sorted_distances(template[None])
-    blocks = np.array_split(points, 1 + len(points) * len(i) // MOST_DISTANCES)
-    return np.concatenate([(np.abs(sorted_distances(b) - wanted) <= 2 * limit).all(axis=1) for b in blocks])
-
-
-def _fit(points: np.ndarray, molecule: Molecule) -> TemplateFit:
-    """Best rigid fit of a template to whole molecules (m, s, 3), with coinciding centres of mass."""
-    sites = massive_sites(molecule)
-    masses, template = molecule.masses[sites], molecule.positions_body[sites]
-    centre = points[:, 0] + np.einsum("s,nsk->nk", masses, points - points[:, :1]) / masses.sum()
-    relative = points - centre[:, None]
-    rotation = align(template, relative, masses)
-    off = np.linalg.norm(relative - np.einsum("nij,sj->nsi", rotation, template), axis=2)
-    return TemplateFit(centre, rotation, off.max(axis=1), (off**2).mean(axis=1))
-
-
-def _search_order(
-    points: np.ndarray, molecule: Molecule, allowed: np.ndarray, limit: float, most: int = MOST_TRIES
-) -> list[int] | None:
-    """An order of the atoms (s, 3) in which the template fits within `limit`, or None. A depth-first search assigns
-    atoms to sites one by one so that all distances agree: first closely, then up to twice the limit, which every fit
-    within the limit satisfies."""
-    template = molecule.positions_body[massive_sites(molecule)]
-    wanted = np.linalg.norm(template[:, None] - template, axis=2)
-    there = np.linalg.norm(points[:, None] - points, axis=2)
-    tries = 0
-
-    def extended(order: list[int], closeness: float) -> list[int] | None:
-        nonlocal tries
-        site = len(order)
-        tries += 1
-        if tries > most:
-            return None
-        if site == len(points):
-            return order if _fit(points[None, order], molecule).deviation[0] <= limit else None
-        off = np.abs(there[:, order] - wanted[site, :site]).max(axis=1, initial=0.0)
-        off[order] = inf
-        off[~allowed[site]] = inf
-        for atom in np.argsort(off):
-            if off[atom] > closeness:
-                return None
-            if found := extended([*order, int(atom)], closeness):
-                return found
-        return None
-
-    for closeness in (0.1, 0.5, 2.0):
-        tries = 0
-        if found := extended([], closeness * limit):
-            return found
-    return None
+    classes = [numbered(group_wanted), numbered(label for _, label in wanted)]
+    return _Candidate(k, order, classes, nameless=False)
