@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rigidmd.scene import BodyScene, MolecularScene, Scene
     from rigidmd.scene.integrators import integrator
     from rigidmd.studies.normal_modes import normal_modes
+    from rigidmd.studies.stored_runs import read_run
     from rigidmd.studies.sweep.sweeping import sweep
     from rigidmd.view.plots import LivePlot
 
@@ -41,13 +42,14 @@ _HOMES = {
     "PairLaw": "assemble.user_code.pair_potential", "pair_law": "assemble.user_code.pair_potential",
     "integrator": "scene.integrators",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
-    "LivePlot": "view.plots", "sweep": "studies.sweep.sweeping", "normal_modes": "studies.normal_modes",
+    "LivePlot": "view.plots", "read_run": "studies.stored_runs", "sweep": "studies.sweep.sweeping",
+    "normal_modes": "studies.normal_modes",
     "analysis": "", "view": "",
 }  # fmt: skip
 __all__ = [
     "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
     "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "normal_modes",
-    "pair_law", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
+    "pair_law", "read_run", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
 ]  # fmt: skip
 
 PROVIDERS.append("rigidmd.view.notebook")

@@ -371,7 +371,7 @@ def test_no_command_writes_through_a_link(command, again, capsys):
     for name in ("report.html", "view.html", "analyses.csv"):
         (run / name).touch()
     files = sorted(path.name for path in run.iterdir() if path.is_file())
-    assert ".trajectory.xtc_offsets.npz" in files and "density_profile.png" in files
+    assert not [name for name in files if "offsets" in name] and "density_profile.png" in files
     shutil.copytree(run, again / "kept")
     arguments = {
         "run": ["run", str(again / "water.toml"), "-o", str(run), "--force", "--set", "stages.0.duration_ps=0.01"],

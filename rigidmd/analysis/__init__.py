@@ -8,6 +8,7 @@ the equilibration. Other arguments are described by help() of the function. They
 from collections.abc import Callable
 from functools import cache
 from inspect import Parameter, signature
+from pathlib import Path
 from typing import Any
 
 from rigidmd.analysis import registry
@@ -36,11 +37,23 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *registry.KNOWN})
 
 
+def _check_results(results: object, name: str) -> None:
+    """Raise TypeError for anything but the results of one run."""
+    if isinstance(results, Results):
+        return
+    of = f"rigidmd.analysis.{name}"
+    if isinstance(results, str | Path):
+        raise TypeError(f"{of} takes the results of a run, not its path: {of}(rigidmd.read_run({str(results)!r}))")
+    of_sweep = "; of a sweep give the results of each run, rigidmd.read_run(path) for the paths in table.runs.values()"
+    raise TypeError(f"{of} takes the results of one run, not {results!r:.80}{of_sweep}")
+
+
 @cache
 def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
     """The function of frames as one of results, with its other parameters and its docstring."""
 
     def function(results: Results, *arguments: Any, start: float | None = None, **options: Any) -> AnalysisResult:
+        _check_results(results, entry.name)
         if start not in results._analysis_frames:
             results._analysis_frames[start] = frames_of_results(results, start)
         return entry.function(results._analysis_frames[start], *arguments, **options)

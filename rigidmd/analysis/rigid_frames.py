@@ -14,7 +14,7 @@ from rigidmd.engines.samples import equilibrated_from, moving
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError
 from rigidmd.io.run_files import TENSOR_FILE, read_tensor
-from rigidmd.io.trajectory import Frames, read_frames
+from rigidmd.io.trajectory import Frames, read_frames, without_rounding
 from rigidmd.run.record import Record, read_record
 from rigidmd.run.results import Results
 from rigidmd.run.rigid_fit import Bodies, Kind, RigidFit, kinds_of
@@ -256,7 +256,7 @@ def _rigid_frames(
         )
     slack = 1e-6 * max(abs(last), 1.0)
     keep = np.flatnonzero((stored.time >= begin - slack) & (stored.time <= last + slack))
-    times = _without_rounding(stored.time[keep])
+    times = without_rounding(stored.time[keep])
     keep, times = (of[np.diff(times, append=np.inf) > 0] for of in (keep, times))
     if len(keep) < 2:
         raise OutputError(
@@ -274,13 +274,6 @@ def _rigid_frames(
         system, stage, times, cells, bodies.position, bodies.Q, bodies.velocity, bodies.L,
         {name: values[samples] for name, values in columns.items()}, tensor, [*notes, *corrections],
     )  # fmt: skip
-
-
-def _without_rounding(time: np.ndarray) -> np.ndarray:
-    """Times (f,) of frames without the rounding of files to single precision, if nothing else makes them uneven."""
-    even = np.linspace(time[0], time[-1], len(time)) if len(time) else time
-    rounding = np.spacing(np.abs(time).max(initial=0.0).astype(np.float32))
-    return even if np.all(np.abs(even - time) <= 2 * rounding) else time
 
 
 def _last_stage(system: System, columns: dict[str, np.ndarray]):

@@ -42,7 +42,8 @@ def energy_figure(system: System, samples: Samples, summary: dict) -> "Picture":
     axes = figure.subplots(2 + known, 1, height_ratios=(1.2, 1, 1)[-2 - known :], sharex=True)
     *_, parts, temperature = axes
     if known:
-        _draw_drift(axes[0], time, column["drift"] / n, stage, summary["stages"][stage[-1]])
+        ended = summary["stages"][stage[-1] : stage[-1] + 1]  # none if the run has not ended
+        _draw_drift(axes[0], time, column["drift"] / n, stage, ended[0] if ended else None)
     for name, color in (("potential", COOL), ("kinetic", WARM)):
         _draw(parts, time, (column[name] - column[name][-1]) / n, stage, color, name)
     parts.set_ylabel("energies less\ntheir last values\n(kJ/mol per molecule)")
@@ -73,8 +74,9 @@ def _draw(axis: "Axes", time: np.ndarray, values: np.ndarray, stage: np.ndarray,
         axis.set_ylim(min(limits[0], *(before or limits)), max(limits[1], *(before or limits)))
 
 
-def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, summary: dict) -> None:
-    """Draw the conserved energy since each stage began, kJ/mol per molecule, and the line of the last drift."""
+def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.ndarray, summary: dict | None) -> None:
+    """Draw the conserved energy since each stage began, kJ/mol per molecule, and the line of the last drift, if there
+    is a summary of its stage."""
     last = stage == stage[-1]
     for k in np.unique(stage):
         of_stage = stage == k
@@ -82,15 +84,17 @@ def _draw_drift(axis: "Axes", time: np.ndarray, drift: np.ndarray, stage: np.nda
     low, high = np.nanmin(drift[last]), np.nanmax(drift[last])
     if high > low:
         axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
+    if summary is None or last.sum() <= 2:
+        return
     gradient, error = summary["drift_kJ_mol_ns_per_molecule"], summary["drift_error_kJ_mol_ns_per_molecule"]
-    if last.sum() > 2 and gradient is not None:
+    if gradient is not None:
         line = drift[last].mean() + gradient / 1000 * (time[last] - time[last].mean())
         axis.plot(time[last], line, color=WARM, lw=1.4)
         title = f"{summary['name']}: drift {format_signed(gradient, error)} kJ/mol/ns per molecule"
         if verdict := summary.get("drift_verdict"):
             title += f": {verdict.partition(',')[0]}"
         axis.set_title(title, loc="left", fontsize=9, color=WARM)
-    axis.set_ylabel("conserved energy since\nthe stage began\n(kJ/mol per molecule)")
 
 
 def _label_stages(axis: "Axes", starts: list[float], labels: list[str]) -> None:

@@ -6,16 +6,17 @@ import re
 import struct
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import MDAnalysis as mda
 import numpy as np
 from MDAnalysis.coordinates.base import ProtoReader, ReaderBase
 from MDAnalysis.coordinates.core import get_reader_for
 from MDAnalysis.coordinates.memory import MemoryReader
+from MDAnalysis.coordinates.XDR import XDRBaseReader
 from MDAnalysis.lib.distances import minimize_vectors, self_capped_distance
 
 from rigidmd.core.files import AppendedFile, atomic_file, writing
@@ -24,7 +25,6 @@ from rigidmd.core.state import State
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import OutputError, SimulationError, StructureError
-from rigidmd.io.folder import offsets_of
 from rigidmd.io.formats import BY_EXTENSION, written
 from rigidmd.io.formats.atoms import Frame
 from rigidmd.io.formats.bonds import charges, connections
@@ -34,6 +34,8 @@ from rigidmd.scene.validation import not_none
 
 #: Frames are evenly spaced if intervals differ by less than this fraction of the longest.
 EVEN = 1e-6
+
+T = TypeVar("T")
 
 
 def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
@@ -52,7 +54,7 @@ def _connect(u: mda.Universe, system: System | BodySystem, massless: bool = True
     u.add_TopologyAttr("bonds", [tuple(pair) for pair in connections(system, massless).tolist()])
 
 
-def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
+def in_memory(system: System | BodySystem, frames: Sequence[Frame]) -> mda.Universe:
     """A Universe of frames in memory, each with its time and box."""
     u = universe(system, system.state)
     _connect(u, system)
@@ -65,7 +67,6 @@ def in_memory(system: System | BodySystem, frames: list[Frame]) -> mda.Universe:
 
 def from_files(system: System | BodySystem, topology: Path, trajectory: Path, times: list[float]) -> mda.Universe:
     """The Universe of a finished run's files, with these times (ps) of its frames, and elements, masses and bonds."""
-    _drop_links(trajectory)
     u = mda.Universe(str(topology), str(trajectory), format=timed(reader_of(trajectory.suffix)), times=_checked(times))
     u.add_TopologyAttr("elements", system.sites.element)
     u.add_TopologyAttr("masses", system.sites.mass)
@@ -95,6 +96,29 @@ class Frames(NamedTuple):
 def read_frames(path: Path, sites: int, most: int) -> Frames:
     """At most `most` evenly spaced frames of a trajectory. An incomplete last frame is left out. Raises OutputError if
     the file cannot be read, or has another number of sites."""
+    return _read(_frames, path, sites, most)
+
+
+def read_times(path: Path, sites: int) -> np.ndarray:
+    """Times (f,) of the frames of a trajectory, ps, without the rounding of files; for errors see `read_frames`."""
+    return without_rounding(np.array(_read(_times, path, sites)))
+
+
+def without_rounding(time: np.ndarray) -> np.ndarray:
+    """Times (f,) of frames without the rounding of files to single precision, if nothing else makes them uneven."""
+    even = np.linspace(_as_decimal(time[0]), _as_decimal(time[-1]), len(time)) if len(time) else time
+    rounding = np.spacing(np.abs(time).max(initial=0.0).astype(np.float32))
+    return even if np.all(np.abs(even - time) <= 2 * rounding) else time
+
+
+def _as_decimal(time: float) -> float:
+    """A time in single precision as the shortest decimal number that is rounded to it."""
+    single = np.float32(time)
+    return float(str(single)) if single == time else float(time)
+
+
+def _read(function: Callable[..., T], path: Path, sites: int, *arguments: Any) -> T:
+    """What a function reads from a trajectory. Raises OutputError for the errors of all readers."""
     if (form := BY_EXTENSION[path.suffix]).check is not None:
         try:
             read_in_process(form.check, path, 0, sites)
@@ -104,7 +128,7 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
         # a reader that could not open its file complains when it is deleted
         hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
         try:
-            return _frames(path, sites, most)
+            return function(path, sites, *arguments)
         except (OSError, EOFError, ValueError, TypeError, IndexError, StopIteration) as error:
             reason = " ".join(str(error).split())
         finally:
@@ -113,24 +137,14 @@ def read_frames(path: Path, sites: int, most: int) -> Frames:
 
 
 def _frames(path: Path, sites: int, most: int) -> Frames:
-    _drop_links(path)
-    with contextlib.closing(reader_of(path.suffix)(str(path))) as reader:
-        if reader.n_atoms != sites:
-            raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
-        count, is_cut = reader.n_frames, False
+    with contextlib.closing(_opened(path, sites)) as reader:
+        count = reader.n_frames
         stride = max(1, -(-count // most))
         selected = range(0, count, stride)
         times, boxes = [], []
         positions = np.empty((len(selected), sites, 3), np.float32)
         velocities = np.empty_like(positions) if count and reader.ts.has_velocities else None
-        for n, k in enumerate(selected):
-            try:
-                frame = reader[k]
-            except (OSError, EOFError, ValueError):
-                if k + stride < count:  # not the last frame
-                    raise OutputError(f"{path}: frame {k + 1} of {count} is not one of {sites} sites") from None
-                is_cut = True
-                break
+        for n, frame in enumerate(_whole_frames(reader, path, selected)):
             times.append(frame.time)
             positions[n] = frame.positions
             boxes.append(None if frame.dimensions is None else frame.triclinic_dimensions)
@@ -138,6 +152,7 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
                 velocities[n] = frame.velocities
     if not times:
         raise OutputError(f"{path} holds no whole frame")
+    is_cut = len(times) < len(selected)
     text_times, text_cells = _times_and_cells_in_text(path)
     if text_times:
         times = text_times[::stride][: len(times)]
@@ -146,6 +161,35 @@ def _frames(path: Path, sites: int, most: int) -> Frames:
         cells = np.array(text_cells[::stride][: len(times)])
     moving = None if velocities is None else velocities[: len(times)]
     return Frames(np.array(times), positions[: len(times)], cells, count, stride, is_cut, moving)
+
+
+def _times(path: Path, sites: int) -> list[float]:
+    with contextlib.closing(_opened(path, sites)) as reader:
+        times = [frame.time for frame in _whole_frames(reader, path, range(reader.n_frames))]
+    text_times, _ = _times_and_cells_in_text(path)
+    return text_times[: len(times)] if text_times else times
+
+
+def _opened(path: Path, sites: int) -> Any:
+    """The reader of a trajectory. Raises OutputError if it has another number of sites."""
+    reader = reader_of(path.suffix)(str(path))
+    if reader.n_atoms != sites:
+        reader.close()
+        raise OutputError(f"{path} is not the trajectory of this run: {reader.n_atoms} sites, must be {sites}")
+    return reader
+
+
+def _whole_frames(reader: Any, path: Path, selected: range) -> Iterator[Any]:
+    """The selected frames of a reader, without an incomplete last one. Raises OutputError for any other."""
+    for k in selected:
+        try:
+            frame = reader[k]
+        except (OSError, EOFError, ValueError):
+            if k + selected.step < reader.n_frames:
+                problem = f"frame {k + 1} of {reader.n_frames} is not one of {reader.n_atoms} sites"
+                raise OutputError(f"{path}: {problem}") from None
+            return
+        yield frame
 
 
 def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]:
@@ -160,13 +204,6 @@ def _times_and_cells_in_text(path: Path) -> tuple[list[float], list[np.ndarray]]
                 if found[1]:
                     cells.append(np.array(found[1].split(), float).reshape(3, 3))
     return times, cells
-
-
-def _drop_links(path: Path) -> None:
-    """Remove symbolic links that MDAnalysis would follow when it writes offsets next to a trajectory."""
-    for offsets in offsets_of(path):
-        if offsets.is_symlink():
-            offsets.unlink()
 
 
 def read_exactly(path: Path) -> list[Frame]:
@@ -252,17 +289,34 @@ class _WithTimes(ProtoReader):
         return self._set_time(super()._read_next_timestep(ts))  # pyright: ignore[reportAbstractUsage]
 
 
+class _WithoutOffsetsFile:
+    """Mixin for the readers of XTC and TRR. Offsets of frames stay in memory: no file is made next to a trajectory, and
+    none there is believed."""
+
+    def _load_offsets(self):
+        self._read_offsets()
+
+    def _read_offsets(self, store=False):
+        super()._read_offsets(store=False)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def reader_of(extension: str) -> Any:
     """MDAnalysis' class of readers of a format."""
     form = BY_EXTENSION[extension]
-    return SiteReader if form.reader else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+    reader = SiteReader if form.reader else get_reader_for(f"x{extension}", form.mdanalysis or extension[1:])
+    return _subclass(_WithoutOffsetsFile, reader) if issubclass(reader, XDRBaseReader) else reader
+
+
+def timed(reader: Any) -> Any:
+    """A subclass of a reader with the times of the run."""
+    return _subclass(_WithTimes, reader)
 
 
 @functools.cache
-def timed(reader: Any) -> Any:
-    """A subclass of a reader with the times of the run, as a name of this module, so that it can be pickled."""
-    name = f"Timed{reader.__name__}"
-    globals()[name] = type(reader)(name, (_WithTimes, reader), {"__module__": __name__})
+def _subclass(mixin: type, reader: Any) -> Any:
+    """A subclass of a reader with a mixin, as a name of this module, so that it can be pickled."""
+    name = f"{reader.__name__}{mixin.__name__}"
+    globals()[name] = type(reader)(name, (mixin, reader), {"__module__": __name__})
     return globals()[name]
 
 

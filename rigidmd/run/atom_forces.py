@@ -49,14 +49,24 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
     """See `Results.atoms`."""
     from ase.calculators.singlepoint import SinglePointCalculator
 
-    system, state, frames = results.system, results.state, results._frames
+    system, frames = results.system, results._frames
     if not isinstance(system, System):
         raise ValueError("this is a run of a single body, which has no atoms")
 
+    def with_logged_energy(atoms: "ase.Atoms", time: float) -> "ase.Atoms":
+        """Atoms with the energy of the log, if it has a line at their time."""
+        if len(same := np.flatnonzero(_same(results["time"], time))):
+            energy = results["potential"][same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
+            atoms.calc = SinglePointCalculator(atoms, energy=float(energy))
+        return atoms
+
     def final() -> "ase.Atoms":
         """The final state, exactly, with its energy, forces and stress."""
+        state = results.state
         found = atoms_of_system(system, state, system.scene.output.positions == "wrapped")
         found.info["time_ps"] = float(state.time[NOW])
+        if results._is_stored:
+            return with_logged_energy(found, float(state.time[NOW]))
         found.calc = SinglePointCalculator(found, **ase_results(system, system.engine(), state))
         return found
 
@@ -65,16 +75,13 @@ def atoms_of_results(results: "Results", frame: int | slice | str | None) -> "as
     if not frames:
         raise ValueError("this run has no frames (output.trajectory = false); atoms() is the final state")
     indices, sites = _frame_indices(frame, len(frames)), _sites_of_frames(results)
-    times, energies, found = results["time"], results["potential"], []
+    found, last = [], results._state
     for k in indices:
         time = frames[k].time
-        if k == len(frames) - 1 and _same(time, float(state.time[NOW])):
+        if k == len(frames) - 1 and last is not None and _same(time, float(last.time[NOW])):
             found.append(final())
-            continue
-        found.append(atoms_of_sites(system, *sites(k), time))
-        if len(same := np.flatnonzero(_same(times, time))):
-            energy = energies[same[-1]] * KJ_PER_MOL / EV  # after a minimisation that begins then
-            found[-1].calc = SinglePointCalculator(found[-1], energy=float(energy))
+        else:
+            found.append(with_logged_energy(atoms_of_sites(system, *sites(k), time), time))
     return found if isinstance(indices, range) else found[0]
 
 

@@ -1,6 +1,6 @@
 """Results of a run: samples, summary, final state, frames; the value that `Simulation.run` returns."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, overload
@@ -9,8 +9,8 @@ import numpy as np
 
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
+from rigidmd.errors import OutputError
 from rigidmd.io.formats import BY_EXTENSION
-from rigidmd.scene.validation import not_none
 
 if TYPE_CHECKING:
     import ase
@@ -32,23 +32,24 @@ class Results(Displayed):
     bar, Å, ps) or, for a body, in SI units. `units` lists all columns with their units.
 
     summary : values with units in their keys, as in summary.json
-    state : the final one, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units
     files : paths of the files written
     interrupted : whether the run ended early, by a signal or at its walltime (`out_of_time`)
     signal : number of the signal, 2 for Ctrl-C, 15 for SIGTERM
     """
 
     system: "System | BodySystem"
-    state: State
+    _state: State | None
     samples: "Samples | Motion"
     summary: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     interrupted: bool = False
     signal: int | None = None
     out_of_time: bool = False
-    _frames: "list[Frame]" = field(default_factory=list)
+    _frames: "Sequence[Frame]" = field(default_factory=list)
     _tensor: np.ndarray | None = None  # (n, 7) rows of the pressure tensor of a run without files
     _analysis_frames: dict[float | None, Any] = field(default_factory=dict)  # kept by rigidmd.analysis, by their start
+    _is_stored: bool = False  # read from a folder, without user-defined forces
+    _no_state: str = ""  # why a stored run has no final state
 
     def __repr__(self) -> str:
         name = self.system.scene.name
@@ -58,6 +59,14 @@ class Results(Displayed):
     def _summary_line(self) -> str:
         files = f"{len(self.files)} files in {self.files[0].parent}" if self.files else "no files"
         return f"{'interrupted, ' if self.interrupted else ''}{len(self.samples)} samples, {files}"
+
+    @property
+    def state(self) -> State:
+        """The final state, for molecules in Å, Å/ps and u Å²/ps, for a body in SI units. Raises OutputError if a run
+        that was read from a folder has none."""
+        if self._state is None:
+            raise OutputError(self._no_state)
+        return self._state
 
     def __contains__(self, column: object) -> bool:
         return column in self.samples.described
@@ -101,10 +110,16 @@ class Results(Displayed):
         if not output.trajectory:
             raise ValueError("this run wrote no trajectory (output.trajectory = false)")
         if self.files:
-            by_name = {path.name: path for path in self.files}
-            topology, times = by_name[not_none(output.topology)], [frame.time for frame in self._frames]
-            return trajectory.from_files(self.system, topology, by_name[output.trajectory], times)
+            times = [frame.time for frame in self._frames]
+            return trajectory.from_files(self.system, self._file(output.topology), self._file(output.trajectory), times)
         return trajectory.in_memory(self.system, self._frames)
+
+    def _file(self, name: str | None) -> Path:
+        """Path of a file of the run. Raises ValueError if it is missing."""
+        for path in self.files:
+            if path.name == name:
+                return path
+        raise ValueError(f"{name} is missing in {self.files[0].parent}")
 
     @overload
     def atoms(self, frame: int | None = None) -> "ase.Atoms": ...
@@ -118,8 +133,9 @@ class Results(Displayed):
 
         Atoms are the sites with mass, with the masses of the models, cell, periodicity, `info["time_ps"]` and, where
         frames have velocities, momenta. The final state, and a last frame at its time, is exact, with energy, forces
-        and stress; other frames have the digits of the trajectory (single precision but for .traj) and the energy
-        where the log has a line at their time. Raises ValueError for a body or without frames, IndexError.
+        and stress; other frames have the digits of the trajectory (single precision but for .traj), and the energy
+        where the log has a line at their time. So has the final state of a run that was read from a folder, without
+        forces. Raises ValueError for a body or without frames, IndexError.
         """
         from rigidmd.run.atom_forces import atoms_of_results
 
@@ -135,12 +151,12 @@ class Results(Displayed):
         """
         if "Q" in self.samples.described:
             return self["Q"][:, None]
-        if len(self.state.rotation) == 0:
+        if len(self.system.state.rotation) == 0:
             raise ValueError("nothing rotates in this run: it has points only")
         if not self._frames:
             raise ValueError("this run has no frames (output.trajectory = false)")
         if self.files:
-            path = next(path for path in self.files if path.name == self.system.scene.output.trajectory)
+            path = self._file(str(self.system.scene.output.trajectory))
             if not BY_EXTENSION[path.suffix].rotations:
                 from rigidmd.run.rigid_fit import RigidFit
 

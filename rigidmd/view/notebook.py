@@ -69,7 +69,8 @@ def results_html(results: Results) -> str:
     summary = results.summary
     text = []
     if isinstance(results.system, BodySystem):
-        text += [f"<p>{html.escape(body_title(summary))}</p>", _table(body_rows(summary))]
+        if "steps" in summary:  # not of a run that has not ended
+            text += [f"<p>{html.escape(body_title(summary))}</p>", _table(body_rows(summary))]
     else:
         for stage in summary["stages"]:
             text += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]

@@ -61,7 +61,8 @@ class Table:
     """Results of a sweep: a row for each combination of values, columns of means and errors.
 
     table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature (K)") of their errors,
-    table["seed"] of the values of a key. failed : point -> why it has no results
+    table["seed"] of the values of a key. failed : point -> why it has no results. runs : point that has finished ->
+    folder of its run, for `rigidmd.read_run`
     """
 
     folder: Path
@@ -69,6 +70,7 @@ class Table:
     rows: list[SweepRow]
     columns: list[str]
     failed: dict[str, str] = field(default_factory=dict)
+    runs: dict[str, Path] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -120,7 +122,7 @@ def key_columns(keys: Iterable[str]) -> list[Column]:
 
 def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> Table:
     """The table of the points that have finished. with_analyses : also of the values of analyses in their folders"""
-    rows, columns, failed = [], {}, {}
+    rows, columns, failed, runs = [], {}, {}, {}
     for values, points in manifest.combinations():
         row = SweepRow(values)
         for point in points:
@@ -135,9 +137,10 @@ def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> T
                 failed[point.folder] = str(error)
                 continue
             row.runs[point.values.get("seed")] = found
+            runs[point.folder] = folder / point.folder
             columns |= dict.fromkeys(found)
         rows.append(row)
-    return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed)
+    return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed, runs)
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
