@@ -613,3 +613,12 @@ def test_stages_of_one_name_are_told_apart(tmp_path):
     found = frames_of_folder(record)
     assert found.stage.ensemble == "nve"
     assert 0.02 - 1e-6 < found.time[0] < found.time[-1] == pytest.approx(0.22)
+
+
+def test_figures_are_of_the_requested_type(copy, capsys):
+    before = {path.name for path in copy.iterdir()}
+    for kind in ("svg", "png"):
+        assert cli.main(["analyse", str(copy), "--only", "msd,density_profile", "--figures", kind]) == 0
+        made = {path.name for path in copy.iterdir()} - before
+        # no figure of another type stays from the analysis before
+        assert made == {"analysis.json", "msd.csv", f"msd.{kind}", "density_profile.csv", f"density_profile.{kind}"}

@@ -8,7 +8,19 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from support import NOTEBOOKS, ROOT, SYSTEMS, examples_in, live_plot, progress, save_figure, small_scene
+from support import (
+    NOTEBOOKS,
+    ROOT,
+    SYSTEMS,
+    AnalysisResult,
+    Curve,
+    Value,
+    examples_in,
+    live_plot,
+    progress,
+    save_figure,
+    small_scene,
+)
 
 import rigidmd
 from rigidmd.commands.cli import main
@@ -157,6 +169,60 @@ def test_scenes_and_results_show_tables_and_a_figure(tmp_path):
     assert 'class="paper"' in Simulation(top()).run()._repr_html_()  # a lit sphere is on white
 
 
+def test_analyses_show_values_and_a_figure(tmp_path):
+    output = {"trajectory_interval_ps": 0.004}
+    results = Simulation(small_scene({"argon": 20}, 20.0, stages=[{"duration_ps": 0.2}], output=output)).run()
+    g, moved = rigidmd.analysis.rdf(results, "argon", "argon"), rigidmd.analysis.msd(results)
+    for result, names in ((g, ["r (A)", "g argon-argon"]), (moved, ["Time (ps)", "MSD argon (A^2)"])):
+        shown = result._repr_html_()
+        Balance(shown)
+        assert "<svg" in shown
+        assert result.about in shown
+        table = result.to_dataframe()
+        assert list(table)[:2] == names
+        assert (table[names[1]].to_numpy() == result[names[1]]).all()
+        assert f"{names[1]} error" in table
+        assert len(repr(result.curves)) < 200
+        (axis,) = result.plot().axes
+        assert axis.get_xlabel() == names[0].replace("(A)", "(Å)")
+    with pytest.raises(KeyError, match=rf"no curve 'g'; there are {g.curves[0].file}"):
+        g.plot("g")
+    g.plot().savefig(tmp_path / "g.svg")
+    assert (tmp_path / "g.svg").read_text().startswith("<?xml")
+
+
+def test_an_analysis_of_values_shows_their_notes():
+    values = [Value("D", "1e-9 m^2/s", 2.5, 0.25, 1.0), Value("D inf", "1e-9 m^2/s", None, None, None, "too <short>")]
+    result = AnalysisResult("diffusion", "diffusion", values, notes=["a note"])
+    shown = result._repr_html_()
+    Balance(shown)
+    for part in ("2.50 ± 0.25 1e-9 m^2/s", "too &lt;short&gt;", "a note"):
+        assert part in shown
+    assert list(result.to_dataframe()["error"])[:1] == [0.25]
+    with pytest.raises(ValueError, match="diffusion has no curves"):
+        result.plot()
+
+
+def test_an_analysis_of_several_curves_has_a_panel_for_each():
+    axis = ("t", np.arange(3.0))
+    curves = [Curve(name, axis, name, {name: np.arange(3.0)}) for name in ("one", "two", "three")]
+    result = AnalysisResult("several", "several curves", [], curves)
+    assert [panel.get_ylabel() for panel in result.plot().axes if panel.get_visible()] == ["one", "two", "three"]
+    assert [panel.get_ylabel() for panel in result.plot("two").axes] == ["two"]
+    assert list(result.to_dataframe("three")) == ["t", "three"]
+
+
+def test_a_sweep_shows_its_progress(cell, tmp_path):
+    scene = tmp_path / "top.toml"
+    scene.write_text(TOP.read_text())
+    points = {"run.duration_s": 0.05, "output.figures": False, "run.timestep_s": [1e-3, 5e-4]}
+    rigidmd.sweep(scene, points, tmp_path / "sweep", jobs=1)
+    (shown,) = cell
+    assert re.fullmatch(r"100 %: 2 points in [\d.]+ s", shown[-1]["text/plain"])
+    rigidmd.sweep(scene, points, tmp_path / "sweep")  # nothing is left
+    assert len(cell) == 1
+
+
 @pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.stem)
 def test_every_shipped_scene_shows_itself(path):
     text = Scene.read(path)._repr_html_()
@@ -299,7 +365,7 @@ def test_the_tutorial_runs(tmp_path):
 
     shown = shown_by(executed(tmp_path, shorter))
     assert sum("image/png" in bundle for bundle in shown) == 4  # columns, errors of steps, the live plot, g(r)
-    assert sum("<svg" in bundle.get("text/html", "") for bundle in shown) == 2
+    assert sum("<svg" in bundle.get("text/html", "") for bundle in shown) == 3  # results, an analysis
     assert sum("<progress" in bundle.get("text/html", "") for bundle in shown) == 3
     hand, run = re.search(
         r"by formula ([\d.]+)°, in the run ([\d.]+)°", "".join(b["text/plain"] for b in shown)

@@ -12,7 +12,6 @@ from MDAnalysis.analysis.dielectric import DielectricConstant
 from scenes import FORTY_WATERS, NVT, forty_waters
 from support import (
     Frame,
-    _without_rounding,
     build,
     formats,
     from_files,
@@ -26,6 +25,7 @@ from support import (
     reader_of,
     reading_process,
     small_scene,
+    without_rounding,
     write_topology,
 )
 
@@ -151,10 +151,10 @@ def test_times_in_single_precision_are_evened_where_they_can_be():
     times = 4.3e6 + 0.1 * np.arange(200)
     rounded = times.astype(np.float32).astype(float)
     assert np.diff(rounded).min() == 0
-    assert _without_rounding(rounded) == pytest.approx(times, abs=0.3)
-    assert np.diff(_without_rounding(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
+    assert without_rounding(rounded) == pytest.approx(times, abs=0.3)
+    assert np.diff(without_rounding(rounded)) == pytest.approx(np.full(199, 0.1), rel=0.03)
     for uneven in (np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]), np.array([2.0]), np.array([])):
-        assert np.array_equal(_without_rounding(uneven), uneven)
+        assert np.array_equal(without_rounding(uneven), uneven)
 
 
 @pytest.mark.parametrize(

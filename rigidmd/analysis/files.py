@@ -1,47 +1,49 @@
 """Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each curve."""
 
-# isort: skip_file
 import csv
-import re
 from collections.abc import Callable
 from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
 from rigidmd.errors import OutputError
-from rigidmd.figures.style import (
-    COLORS, FAINT, INK, label_minor_ticks, new_figure, open_axis, thin_series, write_figure,
-)  # fmt: skip
+from rigidmd.figures.style import write_figure
 from rigidmd.io.folder import add_to_folder, written_by_runs
 from rigidmd.io.run_files import Bounded, read_columns, read_json
 from rigidmd.io.write import nine_digits, write_csv, write_json
 from rigidmd.run.record import read_record
 
 ANALYSIS = "analysis.json"
-WIDTH, HEIGHT, MOST_CURVES = 5.2, 3.2, 10  # size of a figure, inches, and most curves in it
-UNDRAWN = re.compile(r"n .+-.+")  # headers of columns that are in the file and not drawn
+FIGURES = ("png", "svg", "pdf")  # types of files of figures
 
 
 def write_results(
-    folder: Path, frames_used: dict[str, Any], results: list[AnalysisResult], failed: dict[str, str]
+    folder: Path,
+    frames_used: dict[str, Any],
+    results: list[AnalysisResult],
+    failed: dict[str, str],
+    figures: str = FIGURES[0],
 ) -> list[Path]:
     """Write results; entries of other analyses in the folder stay. Returns the files. Raises OutputError.
 
     frames_used : see `AnalysisOutput`; failed : analysis -> a sentence on why it has failed
+    figures : type of the figures, one of FIGURES
     """
     known = read_table(folder)
     owner = {name: analysis for analysis, entry in known.items() for name in entry.files}
     marked = written_by_runs(folder)
     new, files = {}, {}
     for result in results:
-        names = files[result.name] = [f"{curve.file}{end}" for curve in result.curves for end in (".csv", ".png")]
+        names = files[result.name] = [
+            f"{curve.file}{end}" for curve in result.curves for end in (".csv", f".{figures}")
+        ]
         for name in names:
             if others := {new.setdefault(name, result.name), owner.get(name, result.name)} - {result.name}:
                 raise OutputError(f"{folder / name} is a file of the analysis {others.pop()}; rename {result.name}")
@@ -60,16 +62,14 @@ def write_results(
         }  # fmt: skip
     entries = dict(sorted(entries.items(), key=lambda entry: analysis_order(entry[0])))
     for curve in curves:
-        columns = dict([curve.axis])
-        for header, values in curve.columns.items():
-            columns[header] = values
-            if header in curve.errors:
-                columns[f"{header} error"] = curve.errors[header]
+        columns = curve.table
         lines = (list(map(nine_digits, line)) for line in zip(*columns.values(), strict=True))
         write_csv(folder / f"{curve.file}.csv", [list(columns), *lines], csv.QUOTE_NONNUMERIC)
     write_json(folder / ANALYSIS, {"analyses": entries}, indent=1, ensure_ascii=False)
     for curve in curves:
-        write_figure(folder / f"{curve.file}.png", partial(curve_figure, curve))
+        write_figure(folder / f"{curve.file}.{figures}", partial(curve_figure, curve))
+        for other in {f"{curve.file}.{kind}" for kind in FIGURES} & owner.keys() & {*marked} - new.keys():
+            (folder / other).unlink(missing_ok=True)  # a figure of the results before
     return [path for name in (ANALYSIS, *new) if (path := folder / name).is_file()]
 
 
@@ -134,39 +134,6 @@ def read_results(folder: Path) -> list[tuple[AnalysisResult, str]]:
     return found
 
 
-def curve_figure(curve: Curve):
-    """The figure of a curve: each column with a band of one standard error."""
-    figure = new_figure(WIDTH, HEIGHT)
-    axis = figure.subplots()
-    header, x = curve.axis
-    shown = [title for title in curve.columns if not UNDRAWN.fullmatch(title)][:MOST_CURVES]
-    seen = x > 0 if curve.log[0] else np.ones(len(x), bool)
-    if curve.level is not None:
-        axis.axhline(curve.level, color=FAINT, lw=0.7)
-    for color, title in zip(COLORS, shown, strict=False):
-        values = curve.columns[title]
-        if curve.bars:
-            axis.bar(x, values, color=color, width=0.7)
-            continue
-        axis.plot(*thin_series(x[seen], values[seen]), color=color, lw=1.0, label=title)
-        error = curve.errors.get(title)
-        if error is not None and np.isfinite(error).all():
-            axis.fill_between(x[seen], (values - error)[seen], (values + error)[seen], color=color, alpha=0.25, lw=0)
-    for line, is_log, name in ((axis.xaxis, curve.log[0], "x"), (axis.yaxis, curve.log[1], "y")):
-        if is_log:
-            getattr(axis, f"set_{name}scale")("log")
-            label_minor_ticks(line)
-    axis.set_xlabel(header.replace("(A)", "(Å)").replace("1/A", "1/Å"), fontsize=9, color=INK)
-    axis.set_ylabel(curve.label, fontsize=9, color=INK)
-    open_axis(axis, labelsize=8)
-    if len(shown) > 1 and not curve.bars:
-        figure.legend(
-            *axis.get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=7,
-            handlelength=1.4, labelcolor=INK,
-        )  # fmt: skip
-    return figure
-
-
 READING = 0.25  # fraction of the progress for reading frames
 
 
@@ -180,15 +147,20 @@ class AnalysisOutput(NamedTuple):
 
 
 def analyse_folder(
-    folder: Path, names: list[str], start: float | None = None, viscosity: float | None = None,
+    folder: Path,
+    names: list[str],
+    start: float | None = None,
+    viscosity: float | None = None,
     progress: Callable[[float, str], object] = lambda fraction, name: None,
-) -> AnalysisOutput:  # fmt: skip
+    figures: str = FIGURES[0],
+) -> AnalysisOutput:
     """Analyse the run in a folder and write the files into it. Raises OutputError.
 
     An analysis that is not possible is left out with a sentence, unless it was requested by name.
 
     names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
     progress : called with the fraction done and the name of the present work
+    figures : type of the figures, one of FIGURES
     """
     entries = selected(names)
     reading = lambda fraction: progress(READING * fraction, "reading frames")  # noqa: E731
@@ -209,6 +181,6 @@ def analyse_folder(
     time = frames.time
     used = {"stage": frames.stage.label, "from_ps": float(time[0]), "to_ps": float(time[-1]), "frames": len(time)}
     used |= {"notes": frames.notes}
-    files = write_results(folder, used, results, failed)
+    files = write_results(folder, used, results, failed, figures)
     progress(1.0, "")
     return AnalysisOutput(used, results, failed, files)

@@ -3,14 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import error_of_mean, format_with_error
 from rigidmd.io.run_files import Bounded
 from rigidmd.run.rigid_fit import Kind
+
+if TYPE_CHECKING:
+    import pandas
+
+    from rigidmd.figures.picture import Picture
 
 #: Blocks of frames whose scatter gives errors. The error of an error is one third.
 BLOCKS = 5
@@ -47,7 +53,7 @@ class Value(NamedTuple):
         return f"{self.name}: {format_with_error(self.value, self.error)}{unit}{note}"
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Curve:
     """Columns over an axis: one CSV file, one figure.
 
@@ -68,15 +74,30 @@ class Curve:
     level: float | None = None
     bars: bool = False
 
+    def __repr__(self) -> str:
+        """Short: the numbers of a curve would flood a screen."""
+        return f"<Curve {self.file}: {', '.join(self.columns)} against {self.axis[0]}, {len(self.axis[1])} points>"
+
+    @property
+    def table(self) -> dict[str, np.ndarray]:
+        """The columns of its CSV file: the axis, and each column followed by its errors."""
+        found = dict([self.axis])
+        for header, values in self.columns.items():
+            found[header] = values
+            if header in self.errors:
+                found[f"{header} error"] = self.errors[header]
+        return found
+
     def add(self, title: str, values: np.ndarray, errors: np.ndarray) -> None:
         self.columns[title], self.errors[title] = values, errors
 
 
-@dataclass(eq=False)
-class AnalysisResult:
-    """The result of an analysis: values, curves, notes.
+@dataclass(eq=False, repr=False)
+class AnalysisResult(Displayed):
+    """The result of an analysis: values, curves, notes. A notebook displays them with a figure.
 
-    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value.
+    result["g OW-OW"] is a column of its curves, result.value("D of spce") a value; result.plot() is a figure,
+    result.to_dataframe() a table.
     """
 
     name: str
@@ -89,8 +110,7 @@ class AnalysisResult:
         """A column of its curves. Raises KeyError with all names."""
         known: dict[str, np.ndarray] = {}
         for curve in self.curves:
-            known |= {curve.axis[0]: curve.axis[1]} | curve.columns
-            known |= {f"{header} error": error for header, error in curve.errors.items()}
+            known |= curve.table
         if column not in known:
             raise KeyError(f"no column {column!r}; there are {', '.join(known)}")
         return known[column]
@@ -101,6 +121,40 @@ class AnalysisResult:
             if name in ("", value.name):
                 return value
         raise KeyError(f"no value {name!r}; there are {', '.join(value.name for value in self.values)}")
+
+    def plot(self, curve: str = "") -> "Picture":
+        """A Matplotlib figure of its curves, which a notebook displays and `savefig` writes, as PNG, SVG or PDF by the
+        extension. Bands are of one standard error.
+
+        curve : name of one of `curves`; default: a panel for each. Raises KeyError, ValueError without curves
+        """
+        from rigidmd.analysis.curve_figure import curve_figure, curves_figure  # Matplotlib is slow to import
+
+        if not self.curves:
+            raise ValueError(f"the analysis {self.name} has no curves: {'; '.join(map(str, self.values))}")
+        if curve or len(self.curves) == 1:
+            return curve_figure(self._curve(curve))
+        return curves_figure(self.curves, self.about)
+
+    def to_dataframe(self, curve: str = "") -> "pandas.DataFrame":
+        """The columns of a curve with their errors, as in its CSV file; of an analysis without curves its values.
+
+        curve : name of one of `curves`; default: the first. Raises KeyError, ImportError without pandas
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_dataframe() needs pandas: pip install pandas") from None
+        if self.curves or curve:
+            return pandas.DataFrame(self._curve(curve).table)
+        return pandas.DataFrame(self.values, columns=list(Value._fields))
+
+    def _curve(self, name: str) -> Curve:
+        """The curve of this name; without a name the first. Raises KeyError with all names."""
+        for curve in self.curves:
+            if name in ("", curve.file):
+                return curve
+        raise KeyError(f"no curve {name!r}; there are {', '.join(curve.file for curve in self.curves)}")
 
     def __str__(self) -> str:
         curves = [f"{', '.join(curve.columns)} against {curve.axis[0]}" for curve in self.curves]

@@ -26,6 +26,7 @@ class _List(argparse.Action):
         help="use frames from this time of the run on, such as 10ps (default: where it is found to be equilibrated)"),
     argument("--viscosity", type=number(float, 1e-300, 1e12, "a viscosity above 0"), metavar="VALUE",
         help="viscosity in mPa s for the correction of D for the size of the box (default: measured in the run)"),
+    argument("--figures", choices=["png", "svg", "pdf"], default="png", help="type of the figures (default: png)"),
     argument("--extrapolate", metavar="KEY",
         help="of a sweep: extrapolate all averages and values to a step of 0 over this time step, which the sweep "
         "varies, such as stages.1.timestep_fs"),
@@ -47,7 +48,7 @@ def _analyse(options: Options) -> int:
     with progress_bar() as progress:
         folder, request = Path(options.folder), (options.only, options.start, options.viscosity)
         if is_sweep(folder):
-            found = analyse_sweep(folder, *request, progress)
+            found = analyse_sweep(folder, *request, progress, options.figures)
             progress(1.0, "")
             for of in found:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
@@ -61,7 +62,7 @@ def _analyse(options: Options) -> int:
             return 0
         if options.extrapolate is not None:
             raise OutputError(f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run")
-        done = analyse_folder(folder, *request, progress)
+        done = analyse_folder(folder, *request, progress, options.figures)
     used = done.frames_used
     print(f"{options.folder}: {used['frames']} frames from {used['from_ps']:g} to {used['to_ps']:g} ps")
     for note in used["notes"]:

@@ -138,20 +138,16 @@ def _shown_on(bar: "Bar") -> Callable[[str, str, Any], None]:
     """A function that shows messages of points: fractions as progress, warnings once each, failures at once."""
     from tqdm import tqdm
 
-    fractions: dict[str, float] = {}
+    from rigidmd.studies.sweep.sweeping import ProgressOfPoints
+
+    progress = ProgressOfPoints(bar)
     shown: set[str] = set()
 
     def receive(name: str, kind: str, value: Any) -> None:
+        progress(name, kind, value)
         line = ""
-        if kind in ("fraction", "ended", "died"):
-            before, begins = fractions.get(name, 0.0), kind == "fraction" and name not in fractions
-            finished = kind == "ended" and value["state"] == "finished"
-            now = value if kind == "fraction" else 1.0 if finished else before
-            if begins and not fractions:
-                bar.unpause()  # this is when the first steps begin
-            fractions[name] = max(before, now)
-            (bar.skip if begins else bar.update)(max(0.0, now - before))  # skip what a resumed point had before
-            why = value if kind == "died" else value["message"] if kind == "ended" else None
+        if kind in ("ended", "died"):
+            why = value if kind == "died" else value["message"]
             line = f"  {name}: {visible(why)}" if why else ""
         elif value not in shown and (kind == "warned" or (kind == "announced" and value.startswith("compiling"))):
             shown.add(value)

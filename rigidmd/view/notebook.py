@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from rigidmd.analysis.result import AnalysisResult, Value
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.species import species_of
 from rigidmd.assemble.stage_description import describe_stage
 from rigidmd.core.display import html as html_of
 from rigidmd.core.files import write_text
+from rigidmd.core.statistics import format_with_error
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
 from rigidmd.errors import InputError, OutputError
@@ -32,6 +34,8 @@ from rigidmd.view.run_page import FILM_STYLE, animation_parts
 
 if TYPE_CHECKING:
     from chemiscope.widget import StructureWidget
+
+    from rigidmd.figures.picture import Picture
 
 STYLE = read_asset("notebook.css")
 #: What acts on a body: a table of its scene, and its title.
@@ -75,15 +79,38 @@ def results_html(results: Results) -> str:
         for stage in summary["stages"]:
             text += [f"<p>{html.escape(stage_title(stage))}</p>", _table(stage_rows(stage))]
     drawn = run_figures(results.system, results.samples, summary)
-    left = f"<div>{''.join(text)}{notes(summary['notes'])}</div>"
-    right = ""
-    for name, drawing in list(drawn.items())[:1]:
-        # in the colours of the notebook, or on white if it has a shaded solid
-        svg = figure(drawing, f"{results.system.scene.name}-{name}", f"figure: {name}").replace("#000000", "var(--ink)")
-        svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
-        right = f'<div><div class="{"paper" if "<image" in svg else "figure"}">{svg}</div></div>'
-    body = f'<div class="sides">{left}{right}</div>{_columns(results)}'
-    return _framed(results.system.scene.name, results._summary_line, body)
+    left = f"{''.join(text)}{notes(summary['notes'])}"
+    name, drawing = next(iter(drawn.items()), ("", None))
+    right = _drawing(drawing, f"{results.system.scene.name}-{name}", f"figure: {name}")
+    return _framed(results.system.scene.name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
+
+
+@html_of.register
+def analysis_html(result: AnalysisResult) -> str:
+    rows = [(value.name, _measured(value), value.note) for value in result.values]
+    right = _drawing(result.plot() if result.curves else None, f"analysis-{result.name}", result.about)
+    left = f"{table([], rows, words=True)}{notes(result.notes)}"
+    return _framed(result.name, result.about, _sides(left, right))
+
+
+def _measured(value: Value) -> str:
+    """A value with its error and unit; empty without one, as its note has the reason."""
+    unit = "" if value.unit in ("", "1") else f" {value.unit}"
+    return "" if value.value is None else f"{format_with_error(value.value, value.error)}{unit}"
+
+
+def _sides(left: str, right: str) -> str:
+    """Text and figure side by side."""
+    return f'<div class="sides"><div>{left}</div>{f"<div>{right}</div>" if right else ""}</div>'
+
+
+def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
+    """A figure in the colours of the notebook, or on white if it has a shaded solid; empty without one."""
+    if drawing is None:
+        return ""
+    svg = figure(drawing, salt, about).replace("#000000", "var(--ink)")
+    svg = svg.replace("*{stroke-linejoin", ".rigidmd svg *{stroke-linejoin")  # not of the rest of the notebook
+    return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
 
 
 def _framed(name: str, about: str, body: str) -> str:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidmd.analysis.files import curve_figure, read_results
+from rigidmd.analysis.curve_figure import curve_figure
+from rigidmd.analysis.files import read_results
 from rigidmd.assemble.describe import describe
 from rigidmd.core.files import write_text
 from rigidmd.core.shipped import Example, examples

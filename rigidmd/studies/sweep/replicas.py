@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.files import AnalysisOutput, analyse_folder, write_results
+from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_folder, write_results
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.core.files import writing
 from rigidmd.core.statistics import standard_error
@@ -35,12 +35,17 @@ class Combination(NamedTuple):
 
 
 def analyse_sweep(
-    folder: Path, names: list[str], start: float | None, viscosity: float | None, progress: Callable[..., object]
+    folder: Path,
+    names: list[str],
+    start: float | None,
+    viscosity: float | None,
+    progress: Callable[..., object],
+    figures: str = FIGURES[0],
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
     Means over replicas are written into the folder of the sweep, or into a folder for each combination of the other
-    keys, and all values into analysis.csv. names, start, viscosity, progress : see `analyse_folder`
+    keys, and all values into analysis.csv. names, start, viscosity, progress, figures : see `analyse_folder`
     """
     manifest = read_manifest(folder)
     ready = [point for point in manifest.points if state_on_disk(folder, point) == "finished"]
@@ -51,9 +56,13 @@ def analyse_sweep(
     for k, point in enumerate(ready):
         try:
             done[point.folder] = analyse_folder(
-                folder / point.folder, names, start, viscosity,
+                folder / point.folder,
+                names,
+                start,
+                viscosity,
                 lambda part, name, k=k, point=point: progress((k + part) / len(ready), f"{point.folder} {name}"),
-            )  # fmt: skip
+                figures,
+            )
         except OutputError as error:
             if len(ready) == 1:
                 raise
@@ -66,13 +75,19 @@ def analyse_sweep(
         missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
         if runs:
             where = folder / point_name(values, short) if values else folder
-            found.append(_combine(where, describe_values(values, short), values, runs, missed))
+            title = describe_values(values, short)
+            found.append(_combine(where, title, values, runs, missed, figures))
     _write_table(folder, found)
     return found
 
 
 def _combine(
-    where: Path, title: str, values: dict[str, Any], runs: list[AnalysisOutput], missed: dict[str, str]
+    where: Path,
+    title: str,
+    values: dict[str, Any],
+    runs: list[AnalysisOutput],
+    missed: dict[str, str],
+    figures: str,
 ) -> Combination:
     """Means over the runs of a combination; they are written into a folder if there are several."""
     results = over_replicas([run.results for run in runs])
@@ -88,7 +103,8 @@ def _combine(
         "frames": sum(run.frames_used["frames"] for run in runs),
         "notes": [f"means over {len(runs)} runs, errors from their scatter"],
     }
-    return Combination(title, values, len(runs), results, missed | why, write_results(where, frames_used, results, why))
+    files = write_results(where, frames_used, results, why, figures)
+    return Combination(title, values, len(runs), results, missed | why, files)
 
 
 def over_replicas(runs: list[list[AnalysisResult]]) -> list[AnalysisResult]:

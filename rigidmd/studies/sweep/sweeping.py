@@ -19,6 +19,7 @@ from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.errors import OutputError, SceneError, SimulationError
 from rigidmd.io.folder import FolderLock, add_to_folder, is_empty
+from rigidmd.io.progress import Bar, progress_of
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
 from rigidmd.run.schedule import checked_walltime, signal_handler
 from rigidmd.scene import Scene
@@ -125,10 +126,40 @@ def jobs_and_threads(count: int, jobs: int | None, threads: int | None, is_body:
     return jobs, threads or (1 if is_body else max(1, most // jobs))
 
 
+class ProgressOfPoints:
+    """Shows how much of the points is done on a bar; a `receive` of `run_points`."""
+
+    def __init__(self, bar: Bar):
+        self._bar = bar
+        self._fractions: dict[str, float] = {}
+
+    def __call__(self, name: str, kind: str, value: Any) -> None:
+        if kind not in ("fraction", "ended", "died"):
+            return
+        before, begins = self._fractions.get(name, 0.0), kind == "fraction" and name not in self._fractions
+        finished = kind == "ended" and value["state"] == "finished"
+        now = value if kind == "fraction" else 1.0 if finished else before
+        if begins and not self._fractions:
+            self._bar.unpause()  # this is when the first steps begin
+        self._fractions[name] = max(before, now)
+        advance = max(0.0, now - before)
+        if begins:
+            self._bar.skip(advance)  # what a resumed point had before
+        else:
+            self._bar.update(advance)
+
+
 def sweep(
-    scene: str | Path, sets: Mapping[str, Any], folder: str | Path | None = None, *, jobs: int | None = None,
-    threads: int | None = None, force: bool = False, trust: Sequence[str] = (),
-) -> Table:  # fmt: skip
+    scene: str | Path,
+    sets: Mapping[str, Any],
+    folder: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    threads: int | None = None,
+    force: bool = False,
+    trust: Sequence[str] = (),
+    progress: bool | None = None,
+) -> Table:
     """Run a scene file at many points in parallel, and return the table of means and errors, as `rigidmd sweep` does.
 
     table = rigidmd.sweep("water.toml", {"stages.equilibration.temperature_K": [280, 290], "seed": range(1, 9)}, jobs=2)
@@ -137,6 +168,7 @@ def sweep(
     sets : dotted key -> list, tuple or range of values, or one value for all points; all combinations run
     folder : default: runs/NAME-sweep. Points that have finished there are not run again
     jobs, threads : points at a time, threads of each; default: so that all cores have work
+    progress : whether to show progress, as `Simulation.run` does; default: in notebooks
 
     Raises SceneError and OutputError before anything runs, SimulationError if points failed (`sweep.json` has
     the reasons), KeyboardInterrupt after Ctrl-C. The same call continues a sweep.
@@ -146,7 +178,8 @@ def sweep(
         there = open_sweep(stack, Path(scene), axes_of(sets), where, trust=trust, force=force)
         manifest = there.manifest
         pool = Pool(*jobs_and_threads(there.left, jobs, threads, there.is_body))
-        outcome = run_points(there.folder, manifest, pool, trust=trust)
+        with progress_of(there.left, "points", progress if there.left else False) as bar:
+            outcome = run_points(there.folder, manifest, pool, trust=trust, receive=ProgressOfPoints(bar))
         if outcome.signal is not None:
             raise KeyboardInterrupt
         table, _ = collect(there.folder, manifest)
