@@ -27,10 +27,10 @@ def read_run(folder: str | Path) -> Results | Table:
     table = rigidmd.read_run("runs/water-sweep")
     several = [rigidmd.read_run(path) for path in table.runs.values()]
 
-    Of a run these are the `Results` that `Simulation.run` returned, with three differences. Columns that log.csv does
-    not have are NaN. The last frame of `results.atoms` has no forces, because nothing is computed. The results of a run
-    that has not ended are those so far: its summary has only `interrupted` and `notes`, its state is that of the last
-    checkpoint. Of a sweep this is the `Table` that `rigidmd.sweep` returned, of the points that have finished.
+    A run gives the `Results` that `Simulation.run` returned, with three differences. Columns that log.csv does not have
+    are NaN. The last frame of `results.atoms` has no forces, because nothing is computed. A run that has not ended has
+    results so far: its summary has only `interrupted`, `notes` and an empty `stages`, its state is the one of the last
+    checkpoint. A sweep gives the `Table` that `rigidmd.sweep` returned, with the points that have finished.
 
     Raises OutputError if the folder has no run, or a damaged one.
     """
@@ -68,7 +68,7 @@ def _results_of(record: Record) -> Results:
 
 
 def _state_of(record: Record) -> tuple[State | None, str]:
-    """The final state of a run, or that of its last checkpoint; if there is none, None and why."""
+    """The final state of a run, or the state of its last checkpoint; if there is none, None and why."""
     path, start = record.folder / FINAL, record.system.state
     try:
         if record.summary is not None and path.is_file():
