@@ -1,6 +1,7 @@
 """Bad input: each gets one message that says what, where and what to do; no traceback, nothing half-written."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -70,6 +71,18 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("count = 20", "count = 20\nfrozen = null", ["line 7: molecules.0.frozen: is null", "omit the key"]),
         ("[start]", "[output]\npositions = [\n[start]", ["is not TOML", "line 14"]),
         ("timestep_fs = 1", "timestep_fs = 1 fs", ["is not TOML", "line 10"]),
+        ("timestep_fs = 1", 'integrator = "rk4"', ["line 10: stages.0.integrator: is 'rk4': general ODE solvers are for single"]),
+        ("timestep_fs = 1", 'integrator = "MD-VV"', ["is 'MD-VV': write 'velocity_verlet'", "kahan_li_8"]),
+        ("timestep_fs = 1", 'integrator = "sd"', ["thermostat = 'langevin'"]),
+        ("timestep_fs = 1", 'timestep_fs = "1 ps"', ["is '1 ps', must be a number: write 1000, in fs"]),
+        ("duration_ps = 0.01", 'duration_ps = "1 ns"', ["line 9: stages.0.duration_ps: is '1 ns'", "write 1000, in ps"]),
+        ("lengths_A = 20.0", 'lengths_A = "2 nm"', ["must be a number or a list: write 20, in Å"]),
+        ("temperature_K = 300", 'temperature_K = "300"', ["must be a number: write 300 without quotes"]),
+        ("temperature_K = 300", 'temperature_K = "27 C"', ["write it without unit, in the one that the key names"]),
+        ("[start]", "[watch]\nvolume = 0.5\n[start]", ["watch.volume: is 0.5, must be greater than 1 or false"]),
+        ("[start]", "[watch]\nvolume = 1\n[start]", ["watch.volume: is 1, must be greater than 1"]),
+        ("[start]", "[watch]\nmove = 1e-30\n[start]", ["watch.move: is 1e-30, must not be less than 1e-06"]),
+        ("[start]", "[watch]\northogonality = 1e-17\n[start]", ["watch.orthogonality", "not be less than 1e-14"]),
         ("timestep_fs = 1", 'integrator = "verlet"', ["did you mean velocity_verlet or position_verlet?"]),
         ("count = 20", 'count = 20\nfrozen = 1.5', ["molecules.0.frozen", "is 1.5, must be true or false or a list or a text"]),
         ("count = 20", 'count = 20\nfrozen = "1..3"', ["molecules.0.frozen", "'1..3'", "numbers of molecules such as '1-10'"]),
@@ -119,6 +132,87 @@ def test_a_bad_scene(old, new, expected, capsys, tmp_path):
     message = refused(capsys, tmp_path, GOOD.replace(old, new))
     for part in ["bad.toml", *expected] if "passwd" not in new else expected:
         assert part in message
+
+
+#: A stage with a thermostat and a barostat, and time constants that its steps of 2 fs cannot follow.
+SHORT_TIMES = [
+    (
+        {"ensemble": "nvt", "thermostat": "nose_hoover", "thermostat_time_ps": 0.006},
+        "thermostat_time_ps = 0.006 is a period shorter than pi steps, 0.00628 ps",
+    ),
+    (
+        {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": 1e-9},
+        "barostat_time_ps = 1e-09 is shorter than the 0.002 ps between moves of the box",
+    ),
+    (
+        {"ensemble": "npt", "pressure_bar": 1.0, "barostat_time_ps": 0.1, "barostat_interval_ps": 0.2},
+        "barostat_time_ps = 0.1 is shorter than the 0.2 ps between moves of the box",
+    ),
+    (
+        {"ensemble": "nph", "pressure_bar": 1.0, "barostat_time_ps": 0.005, "temperature_K": None},
+        "barostat_time_ps = 0.005 is a period shorter than pi steps, 0.00628 ps",
+    ),
+]
+
+
+@pytest.mark.parametrize(("stage", "message"), SHORT_TIMES)
+def test_a_time_constant_shorter_than_steps(stage, message):
+    stage = {"duration_ps": 1.0, "timestep_fs": 2.0, "temperature_K": 300.0} | stage
+    with pytest.raises(SceneError, match=re.escape(message)):
+        small_scene({"spce": 4}, 13.0, stages=[stage])
+
+
+@pytest.mark.parametrize("key", ["barostat_time_ps", "barostat_interval_ps"])
+def test_an_interval_beyond_all_steps_is_never(key):
+    """The number of steps stays one that kernels can count."""
+    stage = {"ensemble": "npt", "pressure_bar": 1.0, "temperature_K": 300.0, "duration_ps": 1.0, key: 1e30}
+    scene = small_scene({"spce": 4}, 13.0, stages=[stage | ({"barostat": "monte_carlo"} if "interval" in key else {})])
+    assert scene.stages[0].steps < scene.stages[0].moves_every < 2**62
+    assert not [note for note in scene.rounded_times() if "1e+30" in note]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("md.mdp", "is an input file of GROMACS, not a scene: `rigidmd help coming_from`"),
+        ("in.lammps", "is an input file of LAMMPS, not a scene"),
+        ("water.in", "is an input file of LAMMPS, not a scene"),
+        ("run.py", "is an input file of Python, not a scene"),
+        ("start.gro", 'is a structure file, not a scene: a scene names it by [structure] file = "start.gro"'),
+        ("start.pdb", 'a scene names it by [structure] file = "start.pdb"'),
+        ("run.xtc", 'is a trajectory file, not a scene: a scene names it by [structure] file = "run.xtc"'),
+        ("start.g96", "a scene is a TOML file; one that starts from a structure names it by [structure] file"),
+        ("folder", "is a folder; a scene is a file, such as "),
+        ("empty", "is a folder; a scene is a TOML file"),
+        ("run", "is a folder; `rigidmd resume "),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "check", "energy"])
+def test_a_file_that_is_no_scene_is_named(name, expected, command, capsys, tmp_path):
+    path = tmp_path / name
+    match name:
+        case "empty":
+            path.mkdir()
+        case "folder" | "run":
+            path.mkdir()
+            (path / {"folder": "water.toml", "run": "scene.toml"}[name]).write_text("")
+        case _:
+            path.write_text("; comment\nintegrator = md\n")
+    assert main([command, str(path)]) == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_walls_far_apart_or_close_together_leave_a_lattice(tmp_path):
+    """Edges of the space for molecules may differ by any factor; all molecules lie between the walls."""
+    for high in (1e-9, 1e-3, 30.0, 1e30):
+        walls = {"axis": "z", "kind": "harmonic", "acts_on": "centres", "stiffness_kJ_mol_A2": 1.0}
+        scene = small_scene(
+            {"argon": 30}, [20.0, 20.0, 40.0], fields={"walls": [walls | {"positions_A": [0.0, high]}]},
+            box={"periodic": False, "lengths_A": [20.0, 20.0, 40.0]},
+        )  # fmt: skip
+        position = build(scene).state.position
+        assert len({tuple(row) for row in position}) == 30
+        assert 0 < position[:, 2].min() <= position[:, 2].max() < high
 
 
 def test_an_unknown_integrator_lists_the_names_once(capsys, tmp_path):

@@ -301,8 +301,8 @@ def with_strange(system, what):
     [
         ("thermostat", "stages.0.thermostat = 'made_up': {}"), ("barostat", "stages.0.barostat = 'made_up': {}"),
         ("truncation", "forces.truncation = 'made_up': {} has plain and shift and"),
-        ("potential", "coulomb: the pair potential Stranger is left to rigidmd"),
-        ("field", "field: a field is left to rigidmd"), ("term", "term: the term Stranger is left to rigidmd"),
+        ("potential", "coulomb: the pair potential Stranger has no translation for {}"),
+        ("field", "field: a field has no translation for {}"), ("term", "term: the term Stranger has no translation for {}"),
     ],
 )  # fmt: skip
 def test_what_no_table_has_is_refused(name, what, message):
@@ -313,7 +313,7 @@ def test_what_no_table_has_is_refused(name, what, message):
     found = list(table.refusals(force_field_of(with_strange(system, what))))
     assert any(message.format(program.title) in line for line in found), found
     new = set(found) - set(table.refusals(force_field_of(system)))
-    assert new and all("made_up" in line or "left to rigidmd" in line for line in new), new
+    assert new and all("made_up" in line or "has no translation" in line for line in new), new
 
 
 # the precision of OpenMM

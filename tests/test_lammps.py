@@ -233,7 +233,7 @@ def _start_potential(scene: Path) -> float:
     [
         (["stages.0.thermostat=velocity_rescaling"], "stages.0.thermostat = 'velocity_rescaling': LAMMPS has nose_h"),
         (["stages.1.integrator=srkn_4"], "stages.1.integrator = 'srkn_4': LAMMPS moves rigid bodies by velocity_ver"),
-        (["fields.electric_V_per_nm=[0,0,0.1]"], "electric field: a field is left to rigidmd"),
+        (["fields.electric_V_per_nm=[0,0,0.1]"], "electric field: a field has no translation for"),
         (["forces.electrostatics=pme", "forces.ewald_truncation=shift"], "LAMMPS has no shift of the real-space"),
         (
             ["stages.0.ensemble=npt", "stages.0.pressure_bar=1", "stages.0.barostat=monte_carlo"],

@@ -391,7 +391,7 @@ def test_what_openmm_cannot_do_is_told_at_once():
     falling = small_scene(
         {"spce": 4}, 13.0, fields={"electric_V_per_nm": [0.0, 0.0, 0.1]}, engine={"name": "openmm"}, **BOX
     )
-    with pytest.raises(SceneError, match=r"engine.name = .openmm.: electric field: a field is left to rigidmd"):
+    with pytest.raises(SceneError, match=r"engine.name = .openmm.: electric field: a field has no translation for"):
         external_engine(build(falling))
 
 

@@ -9,7 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.defaults import with_defaults, with_engine_defaults, with_momentum_removal
+from rigidmd.assemble.defaults import (
+    with_defaults,
+    with_engine_defaults,
+    with_momentum_removal,
+    without_tail_reason,
+)
 from rigidmd.assemble.memory_check import check_memory
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
@@ -47,10 +52,11 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
     cell = "" if start.cell is None else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
-    resolved = with_defaults(scene, Composition(species, counts, space, start.basis, cell, start.position))
+    composition = Composition(species, counts, space, start.basis, cell, start.position)
+    resolved = with_defaults(scene, composition)
     if faults := [*faults, *resolved.errors]:
         raise SceneError(scene.source, faults)
-    scene = resolved.scene
+    written, scene = scene, resolved.scene
     velocity = start.velocity if scene.structure is not None and scene.structure.velocities else None
     mass, inertia = np.array([m.mass for m in species]), np.where(frozen[:, None], 0.0, [m.inertia for m in species])
     rotor = split_rotor(inertia)
@@ -71,11 +77,15 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     thermal = 0.0 if velocity is None else float(mass[index] @ (velocity**2).sum(axis=1)) / (3 * len(index))
     free = [m for m, rests in zip(species, frozen, strict=True) if not rests]
     scene, precision_reason = with_precision(scene, free, thermal / BOLTZMANN, acting.force_error)
+    without_tail = ""
+    if scene.forces.dispersion == "cutoff" and not scene.forces.tail_correction:
+        is_choice = written.forces.tail_correction is False
+        without_tail = "forces.tail_correction is false" if is_choice else without_tail_reason(written, composition)
     system = System(
         scene=scene, species=species, model=model, space=space, state=state, terms=acting.terms,
         freedom=count_degrees_of_freedom(model), constants=acting.constants, constant_pressure=acting.pressure,
         tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
-        left_out=left_out(scene, acting.terms, model, space, any(m.charges.any() for m in species)),
+        left_out=left_out(scene, acting.terms, model, space, any(m.charges.any() for m in species), without_tail),
         precision_reason=precision_reason, force_error=acting.force_error,
         notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
     )  # fmt: skip
@@ -167,12 +177,17 @@ def wrapped_between_walls(scene: MolecularScene, space: Space, position: np.ndar
     return moved
 
 
-def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space, charged: bool) -> list[str]:
-    """What is not compiled for this scene, and why. charged : whether a site has a charge"""
+def left_out(
+    scene: MolecularScene, terms: dict, model: Model, space: Space, charged: bool, without_tail: str
+) -> list[str]:
+    """What is not compiled for this scene, and why.
+
+    charged : whether a site has a charge
+    without_tail : why there is no tail correction; empty where there is one
+    """
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
     direct = has_sums and forces.electrostatics == "ewald" and forces.dispersion != "pme"
-    without_tail = forces.dispersion == "cutoff" and not forces.tail_correction
     method, has_charges = forces.electrostatics, any(getattr(term, "acts_on_charges", False) for term in terms.values())
     reasons = {
         f"{title}: {'no site has it' if getattr(forces, key) else without}": key not in terms
@@ -186,7 +201,7 @@ def left_out(scene: MolecularScene, terms: dict, model: Model, space: Space, cha
         "thermostat: no NVT or NPT stage": not any(stage.has_thermostat for stage in scene.stages),
         "barostat: no NPT or NPH stage": not any(stage.has_barostat for stage in scene.stages),
         "removal of the total momentum: run.remove_momentum_interval_ps is false": removal is False,
-        "tail correction: only by default in a periodic box that molecules fill evenly": without_tail,
+        f"tail correction: {without_tail}": bool(without_tail),
     }  # fmt: skip
     fields = [kind.title for name, kind in FIELDS.items() if not any(term.startswith(name) for term in terms)]
     return [

@@ -128,13 +128,30 @@ def _with_electrostatics(scene: MolecularScene, composition: Composition) -> tup
         like = forces.truncation in ("plain", "smooth_switch")
         numbers["reaction_field_truncation"] = forces.truncation if like else "shift"
     if forces.tail_correction is None:
-        # a table ends at its cutoff, and a formula may fall too slowly for a correction
-        custom = forces.custom or scene.user_code.forces
-        external = scene.engine.is_external and any(stage.has_barostat for stage in scene.stages)
-        other = custom or external or scene.fields.walls or any(m.frozen for m in scene.molecules)
-        other = other or forces.dispersion != "cutoff"
-        numbers["tail_correction"] = forces.lennard_jones and not other and is_homogeneous(composition)
+        numbers["tail_correction"] = not without_tail_reason(scene, composition)
     return scene.model_copy(update={"forces": forces.model_copy(update=numbers)}), faults
+
+
+def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
+    """Why a scene has no tail correction by default; empty if it has one."""
+    forces = scene.forces
+    if not forces.lennard_jones:
+        return "forces.lennard_jones is false"
+    if forces.dispersion != "cutoff":
+        return f"forces.dispersion = {forces.dispersion!r} sums over all images"
+    if forces.custom or scene.user_code.forces:
+        return "a user's potential may end at its cutoff or fall too slowly for one"
+    if scene.engine.is_external and any(stage.has_barostat for stage in scene.stages):
+        return f"the barostat of {scene.engine.name} does not include it"
+    if scene.fields.walls:
+        return "it is for a uniform liquid, and there are walls"
+    if any(m.frozen for m in scene.molecules):
+        return "it is for a uniform liquid, and molecules are frozen"
+    if composition.space.volume == inf:
+        return "the scene has no periodic box"
+    if not is_homogeneous(composition):
+        return "the molecules do not fill the box evenly"
+    return ""
 
 
 def is_homogeneous(composition: Composition) -> bool:

@@ -10,12 +10,14 @@ from rigidmd.assemble.body import build_body
 from rigidmd.assemble.build import build
 from rigidmd.assemble.memory_check import bytes_of
 from rigidmd.assemble.stage_description import describe_stage
+from rigidmd.assemble.start import output_errors
 from rigidmd.assemble.time_step import MIXED_ERROR
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import edges_and_angles
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.system import System
+from rigidmd.errors import SceneError
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import cell_of
 from rigidmd.forces.potentials.coulomb import ReactionField
@@ -37,7 +39,10 @@ PRECISIONS = {
 def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
     """How a scene would run. Raises the errors of `build` or `build_body`; user_code: see `build`."""
     if isinstance(scene, MolecularScene):
-        return _describe_molecules(build(scene, user_code))
+        system = build(scene, user_code)
+        if faults := output_errors(system):
+            raise SceneError(scene.source, faults)
+        return _describe_molecules(system)
     text = _describe_body(build_body(scene))
     if scene.run.is_auto:
         text += "\nthe integrator and its step, at most this step, are chosen before the run"

@@ -16,6 +16,7 @@ from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.ewald.direct_sum import SAME_BASIS
 from rigidmd.forces.fields.walls import range_of_centres
 from rigidmd.forces.parts import gather_per_molecule
+from rigidmd.io.formats import format_of
 from rigidmd.io.formats.cells import cell_error, pairs_within
 from rigidmd.mechanics.rotation import random_rotations
 from rigidmd.scene import MolecularScene
@@ -79,6 +80,22 @@ def _without_vacuum(scene: MolecularScene, species: list[Molecule]) -> Configura
     return with_reduced_cell(found, "its", may_rotate=False)
 
 
+def output_errors(system: System) -> list[str]:
+    """Messages on files of a run that cannot hold the positions at its start."""
+    output = system.scene.output
+    if not output.trajectory:
+        return []
+    positions = system.site_positions(system.state, output.positions == "wrapped")
+    limits = {name: not_none(format_of(name)).exceeded(positions) for name in (output.topology, output.trajectory)}
+    reach = np.abs(positions).max()
+    advice = "name a file of another format, or set output.trajectory = false"
+    return [
+        f"output: {name} cannot hold the position {reach:.3g} Å of the start, its limit is {limit:g} Å: {advice}"
+        for name, limit in limits.items()
+        if limit is not None
+    ]
+
+
 def residue_numbers(configuration: Configuration) -> np.ndarray:
     """Residue numbers (n,) of the file, else 1, 2, ... within each species."""
     if configuration.number is not None:
@@ -124,11 +141,27 @@ def _start_lattice(
     if faults:
         raise SceneError(scene.source, faults)
     edges = high - low
-    shape = np.maximum(1, np.round(edges / np.cbrt(edges.prod() / n))).astype(int)
-    while shape.prod() < n:
-        shape[np.argmax(edges / shape)] += 1
+    shape = _lattice_shape(edges, n)
     points = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), axis=-1).reshape(-1, 3)
     return low + (points[rng.permutation(len(points))[:n]] + 0.5) * edges / shape
+
+
+def _lattice_shape(edges: np.ndarray, n: int) -> np.ndarray:
+    """Numbers of points (3,) along edges (3,) of a nearly cubic lattice of at least n points.
+
+    An edge shorter than half the spacing has one point, and the other edges set the spacing.
+    """
+    long = np.full(3, True)
+    while True:
+        spacing = (edges[long].prod() / n) ** (1 / long.sum())
+        thin = long & (edges < 0.5 * spacing)
+        if not thin.any():
+            break
+        long &= ~thin
+    shape = np.where(long, np.maximum(1, np.round(edges / spacing)), 1).astype(int)
+    while shape.prod() < n:
+        shape[np.argmax(edges / shape)] += 1
+    return shape
 
 
 #: Lennard-Jones sites of different molecules closer than this fraction of their diameter overlap: the repulsion there

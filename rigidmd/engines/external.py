@@ -65,7 +65,7 @@ class Translations(NamedTuple):
 
     def refusals(self, view: ForceFieldView) -> Iterator[str]:
         """Messages on all that a system has and the engine lacks."""
-        yield from unknown_terms(view.system)
+        yield from unknown_terms(view.system, self.title)
         for key in self.scene:
             table, name = key.name.split(".")
             if key.matters(view) and (message := key.refusal(self.title, getattr(getattr(view.scene, table), name))):

@@ -120,8 +120,8 @@ def force_field_of(system: System) -> ForceFieldView:
     )  # fmt: skip
 
 
-def unknown_terms(system: System) -> Iterator[str]:
-    """Messages on what acts on a system and is not in its view."""
+def unknown_terms(system: System, title: str) -> Iterator[str]:
+    """Messages on what acts on a system and is not in its view, for the engine with a title."""
     for name, term in system.terms.items():
         kind = type(term.potential if isinstance(term, PairForces) else term)
         what = "a user-defined force"
@@ -130,9 +130,9 @@ def unknown_terms(system: System) -> Iterator[str]:
             what = f"the pair potential {kind.__name__}" if isinstance(term, PairForces) else what
             what = "forces.ewald_slab or ewald_surface_permittivity" if isinstance(term, SurfaceDipole) else what
         if name in system.user_terms or kind not in DESCRIBED:
-            yield f"{name.replace('_', ' ')}: {what} is left to rigidmd"
+            yield f"{name.replace('_', ' ')}: {what} has no translation for {title}"
     if system.thermostat is not None:
-        yield "a user-defined thermostat is left to rigidmd"
+        yield f"a user-defined thermostat has no translation for {title}"
 
 
 Potential = TypeVar("Potential")

@@ -3,6 +3,7 @@
 # isort: skip_file
 import os
 import re
+import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
@@ -19,7 +20,7 @@ from rigidmd.core.toml import (
     values_in,
 )  # fmt: skip
 from rigidmd.errors import SceneError
-from rigidmd.io.formats import Format, written
+from rigidmd.io.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
     MOST_TABLES, Section, exact_names, is_within, location_of, numbers_out_of_range, validation_messages,
@@ -32,6 +33,14 @@ if TYPE_CHECKING:
 LONGEST_NAME = 100
 #: Keys that name a file.
 FILE_KEYS = re.compile(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)")
+#: Programs whose input files have these names.
+FOREIGN_INPUTS = {
+    "GROMACS": re.compile(r".*\.(mdp|top|itp|tpr|ndx)"),
+    "LAMMPS": re.compile(r"in\..+|.*\.in"),
+    "Amber": re.compile(r".*\.(mdin|prmtop|parm7)"),
+    "NAMD or CHARMM": re.compile(r".*\.(namd|psf|prm|rtf)"),
+    "Python": re.compile(r".*\.(py|ipynb)"),
+}
 PathName = str | os.PathLike
 AnyScene = TypeVar("AnyScene", "MolecularScene", "BodyScene")
 
@@ -202,7 +211,47 @@ def read_tables(path: Path) -> tuple[dict[str, Any], str]:
         shipped = similar_names(path.stem, [example.name for example in examples()])
         new = f"; `rigidmd new {shipped[0]}` copies a shipped scene" if shipped else "; `rigidmd examples` lists scenes"
         raise SceneError(str(path), [fault + (_similar_files(path, ".toml") or new)])
-    return read_toml(path, SceneError)
+    if path.is_dir():
+        raise SceneError(str(path), [fault + _scenes_in(path)])
+    try:
+        return read_toml(path, SceneError)
+    except SceneError as error:
+        if other := _other_kind_of_file(path):
+            raise SceneError(str(path), [other]) from None
+        if path.suffix in (".toml", ""):
+            raise error
+        advice = "a scene is a TOML file; one that starts from a structure names it by [structure] file"
+        raise SceneError(str(path), [f"{fault}; {advice}" for fault in error.errors]) from None
+
+
+def _scenes_in(folder: Path) -> str:
+    """Which scenes a folder has, and how a run in it is continued, for the message on a folder as a scene."""
+    try:
+        names = sorted(file.name for file in folder.iterdir() if file.suffix == ".toml")
+    except OSError:
+        return ""
+    if "scene.toml" in names:
+        run = shlex.quote(str(folder))
+        return f"; `rigidmd resume {run}` continues the run in it, and {folder / 'scene.toml'} is its scene"
+    if names:
+        return f"; a scene is a file, such as {folder / names[0]}"
+    return "; a scene is a TOML file"
+
+
+def _other_kind_of_file(path: Path) -> str:
+    """What a file that is not TOML is by its name, and where it belongs; empty for other names."""
+    name = path.name.lower()
+    for program, pattern in FOREIGN_INPUTS.items():
+        if pattern.fullmatch(name):
+            return (
+                f"is an input file of {program}, not a scene: `rigidmd help coming_from` lists the keys of a scene "
+                "for the settings of other programs, and `rigidmd new` copies a shipped scene"
+            )
+    if form := format_of(path):
+        kind = "structure" if form.read is not None else "trajectory"
+        key = f'[structure] file = "{path.name}"'
+        return f"is a {kind} file, not a scene: a scene names it by {key}; see `rigidmd help structures`"
+    return ""
 
 
 def default_name(path: Path) -> str:

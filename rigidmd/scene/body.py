@@ -7,9 +7,9 @@ The equations contain no physical constants, so any other consistent units work 
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, Strict
+from pydantic import Field, Strict, field_validator
 
-from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, Rotor, auto_errors
+from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION, SOLIDS, inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
@@ -22,7 +22,7 @@ from rigidmd.scene.body_forces import (
 )  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import (
-    MOST_TABLES, Flag, Limit, NameIn, Number, Positive, Section, Vector, location_of,
+    MOST_TABLES, Flag, Limit, LimitOfEnergy, LimitOfRounding, NameIn, Number, Positive, Section, Vector, location_of,
 )  # fmt: skip
 
 
@@ -244,6 +244,14 @@ class Run(MovedByScheme):
     absolute_tolerance: Positive | None = None
     """Absolute tolerance of dop853 and radau, as a fraction of the size of each variable in the run; default: 1e-10"""
 
+    @field_validator("integrator", mode="before")
+    @classmethod
+    def _moves_bodies(cls, name: Any):
+        if name in WITH_THERMOSTAT:
+            known = ", ".join((*SCHEMES, AUTO, *SOLVERS))
+            raise ValueError(f"is {name!r}, which has a thermostat, for molecules. The integrators are {known}")
+        return name
+
     def _errors(self):
         if self.rotor is not None and self.integrator in SOLVERS:
             yield f"rotor would do nothing with {self.integrator}"
@@ -302,10 +310,10 @@ class BodyOutput(Section):
 class BodyWatch(Section):
     """Limits beyond which a run of a single body stops; false switches a check off."""
 
-    energy: Limit = 1.0
+    energy: LimitOfEnergy = 1.0
     """Largest change of the energy less the work done, in units of the largest energy exchanged so far: the kinetic
     energy at the start and changes of potential energy and work"""
-    orthogonality: Limit | None = None
+    orthogonality: LimitOfRounding | None = None
     """Largest entry of abs(QᵀQ - 1); default: 1e-9, or 0.1 with rk4, dop853 and radau, which do not preserve it"""
     turn_rad: Limit = False
     """Largest rotation of the body in a step"""

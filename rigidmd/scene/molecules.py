@@ -17,7 +17,16 @@ from rigidmd.scene.forces import FORCE_FILES, Forces
 from rigidmd.scene.models import SIZES
 from rigidmd.scene.species import SPECIES_FILES, Box, Molecules, Start, Structure
 from rigidmd.scene.stage import MOST_STEPS, Stage
-from rigidmd.scene.validation import MOST_TABLES, Count, Flag, Limit, Section
+from rigidmd.scene.validation import (
+    MOST_TABLES,
+    Count,
+    Flag,
+    Limit,
+    LimitOfEnergy,
+    LimitOfRounding,
+    LimitOfVolume,
+    Section,
+)
 
 
 class UserCode(NamedTuple):
@@ -109,12 +118,12 @@ class Watch(Section):
     """Largest rotation of a molecule between two evaluations of its forces"""
     kick: Limit = 20.0
     """Largest change of a momentum by one kick, in units of the thermal momentum"""
-    energy: Limit = 0.5
+    energy: LimitOfEnergy = 0.5
     """Largest change of the conserved energy, in units of the kinetic energy: in an nve stage, and within each
     thermostat_time_ps of an nvt stage"""
-    volume: Limit = 8.0
+    volume: LimitOfVolume = 8.0
     """Largest volume of the box under a barostat, in units of the volume at the start"""
-    orthogonality: Limit = 1e-9
+    orthogonality: LimitOfRounding = 1e-9
     """Largest entry of abs(QᵀQ - 1)"""
     stable_step: Flag = True
     """Estimate the longest stable time step at the start of each stage, and warn if timestep_fs is longer"""
@@ -309,7 +318,7 @@ class MolecularScene(Scene):
             of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
             for key, wanted in [*of_run, *of_stage]:
                 taken = wanted and stage.steps_of(wanted) * stage.timestep_fs / 1000
-                if wanted and abs(taken - wanted) > 1e-9 * wanted:
+                if wanted and taken < MOST_STEPS * stage.timestep_fs / 1000 and abs(taken - wanted) > 1e-9 * wanted:
                     together = f"trajectories of {stage.steps_together} " if stage.is_hybrid else ""
                     unit = f"a whole number of {together}steps of {stage.timestep_fs:g} fs"
                     found.setdefault((key, wanted, unit, taken), []).append(f"stages.{k}")

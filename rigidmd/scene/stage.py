@@ -1,12 +1,12 @@
 """The tables [[stages]] of a scene of molecules: each has one ensemble and one time step, or is a minimisation."""
 
 # isort: skip_file
-from math import inf, log
+from math import inf, log, pi
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from rigidmd.core.integrators import AUTO, SCHEMES, WITH_THERMOSTAT, Rotor, auto_errors
+from rigidmd.core.integrators import AUTO, SCHEMES, SOLVERS, WITH_THERMOSTAT, Rotor, auto_errors
 from rigidmd.scene.couplings import (
     BAROSTAT_TIME, BAROSTATS, COMPRESSIBILITY, DEFAULT_THERMOSTAT, THERMOSTATS, BarostatKeys, Six, ThermostatKeys,
     Values,
@@ -46,6 +46,13 @@ REFUSED = {
     "mttk": "MTTK is not available; cell_rescaling samples the same ensemble",
     "c_rescale": "C-rescale is called cell_rescaling in rigidmd",
     "v_rescale": "V-rescale is called velocity_rescaling in rigidmd",
+}
+#: Integrators of single bodies and of other programs -> advice.
+OTHER_INTEGRATORS = {
+    **dict.fromkeys(SOLVERS, "general ODE solvers are for single bodies"),
+    **dict.fromkeys(("md", "md_vv", "leap_frog", "leapfrog"), "write 'velocity_verlet'"),
+    **dict.fromkeys(("sd", "bd", "langevin"), "write ensemble = 'nvt' with thermostat = 'langevin'"),
+    **dict.fromkeys(("steep", "cg", "l_bfgs", "lbfgs"), "write ensemble = 'minimise'"),
 }
 
 
@@ -116,6 +123,15 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             raise ValueError(f"{REFUSED[plain]}. The {field.field_name}s are {', '.join(known)}")
         return name
 
+    @field_validator("integrator", mode="before")
+    @classmethod
+    def _moves_molecules(cls, name: Any, info: ValidationInfo):
+        plain = name.lower().replace("-", "_") if isinstance(name, str) else ""
+        if plain in OTHER_INTEGRATORS and name not in (info.context or ()):
+            known = ", ".join((*SCHEMES, *WITH_THERMOSTAT, AUTO))
+            raise ValueError(f"is {name!r}: {OTHER_INTEGRATORS[plain]}. The integrators are {known}")
+        return name
+
     @field_validator("duration_ps")
     @classmethod
     def _has_duration(cls, duration: float | None, others: ValidationInfo):
@@ -139,6 +155,7 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
         if self.has_barostat:
             yield from self._barostat_errors()
         yield from self._rotor_errors()
+        yield from self._coupling_errors()
         targets = {key: getattr(self, key) for key in ERROR_TARGETS}
         step_keys = [key for key in ("timestep_fs", "rotor") if self._is_given(key)]
         if self.is_hybrid and self.is_auto:
@@ -208,14 +225,30 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             plain = [name for name, scheme in SCHEMES.items() if not scheme.exact_rotor]
             yield f"{self.ensemble} needs an integrator made of Verlet steps: {', '.join(plain)}"
 
+    def _coupling_errors(self):
+        """Messages on time constants that are too short for the steps of the stage."""
+        if self.is_auto or self.is_minimisation:
+            return
+        step = self.timestep_fs * FEMTOSECOND
+        least = pi * step
+        if self.thermostat_kind == "nose_hoover" and self.thermostat_time < least:
+            yield f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
+        if self.barostat_kind == "piston" and self.barostat_time < least:
+            yield f"barostat_time_ps = {self.barostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
+        moves = self.moves_every * step if self.barostat_kind == "cell_rescaling" else 0.0
+        if self.barostat_time < moves:
+            yield f"barostat_time_ps = {self.barostat_time:g} is shorter than the {moves:g} ps between moves of the box"
+
     @property
     def steps(self) -> int:
         return self.steps_of(self.duration) if self.duration else 0
 
     def steps_of(self, interval: float) -> int:
-        """The nearest number of steps to an interval (ps), at least one step or trajectory."""
+        """The nearest number of steps to an interval (ps), at least one step or trajectory; at most `MOST_STEPS`, which
+        no stage has."""
         together = self.steps_together
-        return max(1, round(interval * 1000 / (self.timestep_fs * together))) * together
+        wanted = min(interval * 1000 / self.timestep_fs, MOST_STEPS)
+        return max(1, round(wanted / together)) * together
 
     @property
     def steps_together(self) -> int:

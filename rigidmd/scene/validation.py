@@ -129,9 +129,12 @@ def numbers_out_of_range(data: Any, least: float, largest: float) -> list[tuple[
 
 
 def _either(sentences: list[str]) -> str:
-    """Join messages: "is 1, must be a list" and "is 1, must be a table" become "is 1, must be a list or a table"."""
-    begin, must, _ = sentences[0].partition(", must be ")
-    return " or ".join([sentences[0], *(sentence.removeprefix(begin + must) for sentence in sentences[1:])])
+    """Join messages: "is 1, must be a list" and "is 1, must be a table" become "is 1, must be a list or a table".
+    Advice, after the first colon, comes last."""
+    parts = [sentence.partition(ADVICE) for sentence in sentences]
+    begin, must, _ = parts[0][0].partition(", must be ")
+    either = " or ".join([parts[0][0], *(part[0].removeprefix(begin + must) for part in parts[1:])])
+    return either + next((colon + advice for _, colon, advice in parts if advice), "")
 
 
 def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
@@ -169,6 +172,42 @@ SENTENCES = {
 }
 
 
+#: Begin of advice in a message.
+ADVICE = ": write "
+#: Number of a text with a unit, such as "1 ns".
+WITH_UNIT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zÅµ°/]*\d?)\s*")
+#: By the unit of a key, the sizes of other units in it.
+OTHER_UNITS = {
+    "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
+    "fs": {"as": 1e-3, "fs": 1.0, "ps": 1e3, "ns": 1e6, "s": 1e15},
+    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "nm": 10.0},
+    "K": {"K": 1.0},
+    "bar": {"Pa": 1e-5, "kPa": 1e-2, "MPa": 10.0, "GPa": 1e4, "bar": 1.0, "kbar": 1e3, "atm": 1.01325},
+    "kJ_mol": {"J/mol": 1e-3, "kJ/mol": 1.0, "kcal/mol": 4.184},
+    "deg": {"deg": 1.0, "°": 1.0},
+    "s": {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
+    "m": {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3},
+    "kg": {"mg": 1e-6, "g": 1e-3, "kg": 1.0},
+}
+#: A key whose unit is one of these, and not a product or quotient of units.
+KEY_WITH_UNIT = re.compile(rf"(?:.*_)?[a-z]{{4,}}_({'|'.join(OTHER_UNITS)})")
+
+
+def _as_number(text: str, keys: list) -> str:
+    """Advice on a text where a number is expected: the number in the unit of the key; empty for other texts."""
+    found = WITH_UNIT.fullmatch(text)
+    if not found:
+        return ""
+    number, unit = float(found[1]), found[2]
+    if not unit:
+        return f"{ADVICE}{found[1]} without quotes"
+    key = KEY_WITH_UNIT.fullmatch(str(next((key for key in reversed(keys) if isinstance(key, str)), "")))
+    size = OTHER_UNITS[key[1]].get(unit) if key else None
+    if key is None or size is None:
+        return f"{ADVICE}it without unit, in the one that the key names"
+    return f"{ADVICE}{number * size:.12g}, in {key[1].replace('_', '/').replace('A', 'Å')}"
+
+
 def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
     value = detail["input"]
     shown = "a table" if isinstance(value, dict) else "a list" if isinstance(value, list) else shorten_repr(value)
@@ -182,7 +221,7 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
         case "missing" if isinstance(detail["loc"][-1], int) and isinstance(value, list | tuple):
             return f"has {len(value)} entries, needs more"
         case "literal_error":
-            wanted = context["expected"]
+            wanted = context["expected"].replace("False", "false").replace("True", "true")
             return f"is {shown}, must be {wanted}" + did_you_mean(str(value), re.findall(r"'([^']*)'", wanted))
         case "tuple_type" | "list_type" if isinstance(value, dict):
             return f"is a table, must be a list of tables: write [[{'.'.join(map(str, keys))}]]"
@@ -190,6 +229,8 @@ def _sentence(detail: ErrorDetails, keys: list, model: type[BaseModel]) -> str:
             return f"is {shown}, must be one to five visible ASCII characters without spaces"
         case "string_pattern_mismatch" if "x1f" in context["pattern"]:
             return f"is {shown}, must be one line without control characters"
+        case "float_type" | "int_type" if isinstance(value, str):
+            return SENTENCES[detail["type"]].format(shown=shown) + _as_number(value, keys)
         case kind if kind in SENTENCES:
             return SENTENCES[kind].format(shown=shown, **context)
     return f"is {shown}: {detail['msg']}"
@@ -256,4 +297,8 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]
 
 
-Limit = Positive | Literal[False]
+#: Limits of checks during a run; false switches a check off. A limit below these stops every run.
+Limit = Annotated[float, Strict(), Field(ge=1e-6, allow_inf_nan=False)] | Literal[False]
+LimitOfEnergy = Annotated[float, Strict(), Field(ge=1e-9, allow_inf_nan=False)] | Literal[False]
+LimitOfRounding = Annotated[float, Strict(), Field(ge=1e-14, allow_inf_nan=False)] | Literal[False]
+LimitOfVolume = Annotated[float, Strict(), Field(gt=1, allow_inf_nan=False)] | Literal[False]
