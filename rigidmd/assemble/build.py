@@ -183,7 +183,7 @@ def left_out(
     """What is not compiled for this scene, and why.
 
     charged : whether a site has a charge
-    without_tail : why there is no tail correction; empty where there is one
+    without_tail : why the tail correction is left out; empty if it is included
     """
     forces, removal = scene.forces, scene.run.remove_momentum_interval_ps
     has_sums = any(name.endswith("_reciprocal") for name in terms)
