@@ -15,6 +15,7 @@ from support import (
     inefficiency,
     slope,
     small_scene,
+    steady_from,
 )
 from support import mean_and_error as mean
 
@@ -99,6 +100,42 @@ def test_a_slow_part_below_fast_noise_has_the_error_of_its_batches(levels):
     variance = offset @ offset / 4 / 5 * (1 + 2 * min(max(shared, 0.0), 0.5))
     lost = 1 - inefficiency(values - values.mean()) / len(values)
     assert mean(values) == pytest.approx((np.mean(levels), np.sqrt(1.5 * variance / lost)), rel=1e-9, abs=1e-12)
+
+
+# the equilibrated part
+
+
+@pytest.mark.parametrize(
+    ("times", "n", "low", "high"),
+    [(10, 100, 1.0, 1.35), (20, 500, 0.85, 1.15), (40, 100, 0.75, 1.05), (100, 300, 0.7, 1.0)],
+)
+def test_the_choice_of_the_equilibrated_part_leaves_errors_as_they_are(times, n, low, high):
+    """A series in equilibrium is not cut to a part that happens to be quiet."""
+    rng = np.random.default_rng(7 * n + times)
+    series = np.concatenate([memory(rng, n, n / times) for _ in range(4)])
+    found, known = pulls(series, lambda values: mean(values[steady_from(values) :]))
+    assert low < np.sqrt(np.mean(found**2)) < high
+    assert np.mean(np.abs(found) > 3) < 0.045
+    assert known > 0.95
+    assert np.mean([steady_from(values) > 0 for values in series]) < 0.05
+
+
+@pytest.mark.parametrize("times", [20, 100])
+@pytest.mark.parametrize("size", [3.0, 10.0, 50.0])
+@pytest.mark.parametrize("decay", [0.02, 0.06])
+def test_a_transient_leaves_no_bias_that_the_error_does_not_cover(decay, size, times):
+    """Of this size in standard deviations, decaying in this fraction of 500 samples."""
+    rng = np.random.default_rng(int(size * times))
+    transient = size * np.exp(-np.arange(500) / (500 * decay))
+    series = memory(rng, 500, 500 / times)[:200] + transient
+    found, known = pulls(series, lambda values: mean(values[steady_from(values) :]))
+    assert np.sqrt(np.mean(found**2)) < (1.35 if times == 20 else 1.1)
+    assert known > 0.9
+    if times == 100 and size >= 10:  # it is seen, and little more than it is cut off
+        late = [steady_from(values) for values in series]
+        assert 500 * decay < np.median(late) < 500 * decay * (np.log(size) + 1.5)
+        errors = [mean(values[first:])[1] for values, first in zip(series, late, strict=True)]
+        assert np.median(errors) < 1.8 * np.sqrt(2 / times)
 
 
 def test_few_independent_values_have_the_error_of_student():

@@ -14,6 +14,10 @@ BATCHES, BATCH_FACTOR = 5, 1.5
 #: Degrees of freedom subtracted in the window's estimate, f/(f - 2.5). A Student distribution would need f/(f - 2) if f
 #: did not depend on the estimate; here a short window and a small estimate coincide.
 LOST_FREEDOM = 2.5
+#: A beginning of a series is cut off if it differs from the rest with this two-sided probability of chance. It is small,
+#: because the place of the cut was chosen among many, and a quiet part that is left has too small an error. Degrees of
+#: freedom that are subtracted, as the correlation of few independent samples is underestimated.
+CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
 
 
 def mean_and_error(values: ArrayLike) -> tuple[float | None, float | None]:
@@ -90,12 +94,33 @@ def correlation_time(values: np.ndarray, interval: float) -> float:
 
 
 def steady_from(values: np.ndarray) -> int:
+    """Index in the first half of a series (n,) from which on it is steady: that of `least_error_from`, if the mean of
+    the samples before it differs from the mean of the others by more than their errors explain; else 0."""
+    start = least_error_from(values)
+    return start if start and _begins_elsewhere(values, start) else 0
+
+
+def least_error_from(values: np.ndarray) -> int:
     """Index in the first half of a series (n,) from which on its mean has the smallest standard error of independent
     values: the marginal standard error rule (White 1997, Simulation 69, 323)."""
     left = np.arange(len(values), 0, -1)
     sums, squares = (np.cumsum(x[::-1])[::-1] for x in (values - values.mean(), (values - values.mean()) ** 2))
     error = (squares - sums**2 / left) / left.astype(float) ** 2
     return int(np.argmin(error[: len(values) // 2 + 1]))
+
+
+def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
+    """Whether the mean before an index differs from the mean after it, by a test of Student with the variance and the
+    correlation of the second half of the series."""
+    from scipy import special  # slow to import
+
+    late = values[len(values) // 2 :]
+    samples = inefficiency(late - late.mean())  # per independent one
+    freedom = len(late) / samples
+    variance = late.var(ddof=1) / max(0.25, 1 - 1 / freedom)
+    error = sqrt(variance * (min(1.0, samples / start) + samples / (len(values) - start)))
+    limit = -float(special.stdtrit(max(freedom - CUT_FREEDOM, 0.5), CUT_CHANCE / 2))
+    return abs(float(values[:start].mean() - values[start:].mean())) > limit * error
 
 
 def _window(centred: np.ndarray) -> tuple[float, int]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
-from rigidmd.core.statistics import steady_from
+from rigidmd.core.statistics import least_error_from, steady_from
 from rigidmd.scene.stage import Stage
 
 
@@ -241,9 +241,14 @@ LEAST_SAMPLES = 40
 def equilibrated_from(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> int:
     """Index from which on the samples of a stage are of its equilibrium: where the potential energy and, if the box
     moves, the density are steady (`steady_from`). 0 with few samples, and if the temperature or pressure changes."""
+    return max(map(steady_from, _slow_series(of_stage, stage)), default=0)
+
+
+def _slow_series(of_stage: Mapping[str, np.ndarray] | SampleTable, stage: Stage) -> list[np.ndarray]:
+    """The series of a stage that show its equilibration; none where it cannot be detected."""
     if len(of_stage["time"]) < LEAST_SAMPLES or stage.ramps:
-        return 0
-    return max(steady_from(of_stage[name]) for name in ("potential", *(["density"] if stage.changes_box else [])))
+        return []
+    return [of_stage[name] for name in ("potential", *(["density"] if stage.changes_box else []))]
 
 
 def equilibrated(of_stage: Samples, stage: Stage) -> Samples:
@@ -260,4 +265,5 @@ def describe_equilibrated(of_stage: Mapping[str, np.ndarray] | SampleTable, stag
     if len(time) < LEAST_SAMPLES:
         return f"{whole}, too short to detect equilibration"
     part = f"the last {time[-1] - time[start]:.4g} of {time[-1] - begin:.4g} ps" if start else whole
-    return f"{part}, not yet steady" if start == len(time) // 2 else part
+    drifts = any(least_error_from(values) == len(time) // 2 for values in _slow_series(of_stage, stage))
+    return f"{part}, not yet steady" if drifts else part
