@@ -133,11 +133,7 @@ def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
     and the pressure P_N along the normal, and the mean pressure P_T across it. Raises OutputError."""
     slab = slab_of(frames, axis)
     fitted(slab)
-    if frames.tensor is not None:
-        time, pressure = frames.tensor[:, 0], frames.tensor[:, 1:4].T
-    else:
-        time = frames.columns["time"]
-        pressure = np.array([frames.columns[f"pressure_{x}{x}"] for x in "xyz"])
+    time, pressure = _pressures(frames)
     if len(time) < 2:
         raise OutputError("a surface tension needs samples of the pressure tensor: there are fewer than two")
     normal = pressure[slab.axis]
@@ -158,3 +154,16 @@ def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
     note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
     found.values.append(converged_value("surface tension", "mN/m", value, error, span, tau, note))
     return found
+
+
+def _pressures(frames: RigidFrames) -> tuple[np.ndarray, np.ndarray]:
+    """Times (l,), ps, and diagonal of the pressure tensor (3, l), bar, from its file or the log. Raises OutputError."""
+    if frames.tensor is not None:
+        return frames.tensor[:, 0], frames.tensor[:, 1:4].T
+    names = [f"pressure_{x}{x}" for x in "xyz"]
+    if not all(name in frames.columns for name in names):
+        raise OutputError(
+            "a surface tension needs the pressure tensor, which this run did not write: set "
+            "output.pressure_tensor_interval_ps = 0.05, or output.pressure_tensor = true"
+        )
+    return frames.columns["time"], np.array([frames.columns[name] for name in names])
