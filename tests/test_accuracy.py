@@ -14,6 +14,10 @@ from support import (
     ROOT,
     SCHEMES,
     SPRING,
+    UNSEEN,
+    AveragedQuantity,
+    AverageRun,
+    Averages,
     IntegratorAccuracy,
     MeanAtStep,
     Method,
@@ -550,6 +554,44 @@ def test_a_fit_has_its_chi2_and_the_order_of_the_integrator():
     assert fit.limit == pytest.approx(1, abs=0.1)
     assert fit.slopes["a"][0] == pytest.approx(0.02, rel=0.02)
     assert extrapolate(points[:2]).freedom == 0
+
+
+def test_points_that_no_fit_describes_make_the_error_of_the_limit_larger():
+    """By the root of chi² over its degrees of freedom: two methods at three steps, and then at two."""
+    off = {"a": (0.2, -0.2, 0.3), "b": (-0.1, 0.3, 0.1)}
+    for count, freedom in ((3, 1), (2, 1)):
+        points = [
+            MeanAtStep(name, float(k + 1), 5 + values[k], 0.01 * (k + 1))
+            for name, values in off.items()
+            for k in range(count)
+        ]
+        fit = extrapolate(points)
+        used = [point for point in points if point.timestep <= 2]
+        design = np.array([[1.0, *(point.timestep**2 * (point.method == name) for name in off)] for point in used])
+        errors = np.array([point.error for point in used])
+        weighted = design / errors[:, None]
+        found, (chi2,), _, _ = np.linalg.lstsq(weighted, np.array([point.mean for point in used]) / errors, rcond=None)
+        assert (fit.longest, fit.freedom) == (2.0, freedom)
+        assert fit.chi2 == pytest.approx(chi2) and chi2 > 10
+        assert fit.limit == pytest.approx(found[0])
+        plain = np.sqrt(np.linalg.inv(weighted.T @ weighted)[0, 0])
+        assert fit.limit_error == pytest.approx(plain * np.sqrt(chi2 / freedom))
+
+
+@pytest.mark.parametrize(("slope", "error", "seen"), [(0.1, 1.0, False), (-0.1, 0.5, False), (2.0, 0.1, True)])
+def test_the_step_of_a_bias_that_is_not_seen_allows_for_its_error(slope, error, seen):
+    """Means 5 + slope dt² of two steps whose errors give the slope this error."""
+    steps = np.array([1.0, 2.0])
+    of_mean = error * (steps[1] ** 2 - steps[0] ** 2) / np.sqrt(2)
+    runs = [AverageRun("baoab", "langevin", dt, 1.0, averages={"U": (5 + slope * dt**2, of_mean)}) for dt in steps]
+    quantity = AveragedQuantity("U", "kJ/mol", 2.5)
+    found = Averages("scene", "nvt", 300.0, 10, 60, 5.0, [quantity], runs)
+    fit = found.fit(quantity)
+    assert fit.slopes["baoab + langevin"] == pytest.approx((slope, error))
+    steepest = abs(slope) + (0.0 if seen else UNSEEN * error)
+    step, was_seen = found.step_at_limit("baoab + langevin", quantity)
+    assert was_seen is seen
+    assert step == pytest.approx(np.sqrt(found.bias_limit(quantity) * quantity.bias_size / steepest))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import Engine, build, history, interfaces, random_rotations, small_scene, surface_tension, system_of
+from support import (
+    Engine,
+    build,
+    history,
+    interfaces,
+    random_rotations,
+    slab_of,
+    small_scene,
+    surface_tension,
+    system_of,
+)
 
 from rigidmd import Scene, Simulation
 from rigidmd.errors import OutputError, SceneError
@@ -198,6 +208,23 @@ def test_dipoles_are_counted_along_the_outward_normal():
     assert np.nanmin(seen[4:]) > 0.99
 
 
+def test_sites_of_molecules_that_lie_in_the_interface_have_the_profile_of_the_density():
+    """All molecules have one orientation without symmetry, so that their sites are at other distances than by Q^T."""
+    rng = np.random.default_rng(8)
+    system, positions, cell, _ = synthetic(rng, 60)
+    for seed in (1, 2):
+        Q = np.broadcast_to(random_rotations(np.random.default_rng(seed), 1)[0], (60, 600, 3, 3))
+        frames = history(system, np.arange(60.0), positions, cell, Q)
+        found = slab_of(frames, "z")
+        arms = np.concatenate([np.full(600, (Q[0, 0] @ arm)[2]) for arm in system.species[0].positions_body])
+        centres = np.tile(positions[..., 2], 3)
+        gap = found.distance - (centres + arms)
+        assert np.ptp((gap - gap[:, :1] + 40.0) % 80.0) < 1e-9  # one shift of each frame
+        assert np.ptp(arms) > 0.3
+        inner = np.abs(found.distance) < 5.0
+        assert inner.mean() == pytest.approx(5 / (HALF + (40 - HALF) * VAPOUR / LIQUID), rel=0.05)
+
+
 def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures():
     rng = np.random.default_rng(5)
     system, positions, cell, _ = synthetic(rng)
@@ -210,6 +237,14 @@ def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures()
     assert found.value == pytest.approx(0.01 * 40.0 * 250.0, abs=4 * found.error)
     assert found.unit == "mN/m"
     assert pytest.approx(0.602214, rel=1e-5) == 100 * BAR  # 1 mN/m in u/ps²
+
+
+def test_a_surface_tension_without_the_pressure_tensor_says_what_to_set():
+    rng = np.random.default_rng(6)
+    system, positions, cell, _ = synthetic(rng, 60)
+    Q = random_rotations(rng, 60 * 600).reshape(60, 600, 3, 3)
+    with pytest.raises(OutputError, match=r"pressure tensor, .* set output.pressure_tensor_interval_ps = 0.05"):
+        surface_tension(history(system, np.arange(60.0), positions, cell, Q))
 
 
 def test_what_is_no_slab_is_refused():

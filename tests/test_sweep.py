@@ -26,6 +26,7 @@ from support import (
     Value,
     Waiting,
     code_kind,
+    extrapolate,
     format_ranges,
     format_walltime,
     limits,
@@ -319,6 +320,44 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
         assert float(row["limit error"]) > 0
     assert "<svg" in (folder / "extrapolation.html").read_text("utf-8")
     assert (folder / "extrapolation.png").stat().st_size > 10_000
+
+
+def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
+    """By dt⁴ for srkn_4: 1, 16, 81 times the slope."""
+    folder = tmp_path / "steps"
+    fixed = {"stages.0.duration_ps": 0.5, "output.log_interval_ps": 0.02, "stages.0.integrator": "srkn_4"}
+    with ExitStack() as stack:
+        axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
+        there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
+        for point in there.manifest.points:
+            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+        found = limits.extrapolate_sweep(folder, there.manifest, STEP)
+    assert "dt⁴ (srkn_4)" in found.title
+    assert {limit.fit.order for limit in found.limits} == {4}
+    limit = next(limit for limit in found.limits if limit.quantity == "Temperature (K)" and limit.fit.freedom == 1)
+    assert limit.fit == extrapolate(limit.points, order=4) != extrapolate(limit.points, order=2)
+
+
+def test_a_file_of_one_point_that_changes_is_noticed(tmp_path, monkeypatch):
+    """A key whose values are files."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 5\n")
+    text = ARGON.replace("count = 20\n", "") + '\n[structure]\nfile = "a.xyz"\n'
+    (scene := tmp_path / "argon.toml").write_text(text)
+    axes = sweeping.axes_of({"structure.file": ["a.xyz", "b.xyz"]})
+    with ExitStack() as stack:
+        before = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
+    (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 6\n")
+    with (
+        pytest.raises(OutputError, match=r"another scene: a file that file=b.xyz reads has changed"),
+        ExitStack() as stack,
+    ):
+        sweeping.open_sweep(stack, scene, axes, tmp_path / "s")
+    (tmp_path / "b.xyz").write_text("2\n\nAr 0 0 0\nAr 0 0 5\n")
+    with ExitStack() as stack:
+        after = sweeping.open_sweep(stack, scene, axes, tmp_path / "s").manifest
+    assert [point.scene_sha256 for point in after.points] == [point.scene_sha256 for point in before.points]
 
 
 def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):

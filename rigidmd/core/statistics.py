@@ -14,9 +14,10 @@ BATCHES, BATCH_FACTOR = 5, 1.5
 #: Degrees of freedom subtracted in the window's estimate, f/(f - 2.5). A Student distribution would need f/(f - 2) if f
 #: did not depend on the estimate; here a short window and a small estimate coincide.
 LOST_FREEDOM = 2.5
-#: A beginning of a series is cut off if chance explains its difference from the rest with less than this two-sided
-#: probability. It is small, because the cut was chosen among many, and the quiet part that it may leave has too small an
-#: error. Degrees of freedom that are subtracted, as the correlation of few independent samples is underestimated.
+#: A beginning of a series is cut off if chance explains its difference from the rest with less than this
+#: two-sided probability. It is small, because the cut was chosen among many, and the quiet part that it may
+#: leave has too small an error. Degrees of freedom that are subtracted, as the correlation of few independent
+#: samples is underestimated.
 CUT_CHANCE, CUT_FREEDOM = 1e-4, 2.0
 
 
