@@ -11,6 +11,10 @@ RUN = {"duration_s": 1.0, "timestep_s": 0.01}
 TOP = {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 1.0, 0.5], "pinned": True, "centre_of_mass_m": [0.0, 0.0, 1.0]}
 
 
+BALL = {"shape": "sphere", "radius_m": 1.0}
+CUBE = {"shape": "cuboid", "lengths_m": [1.0, 1.0, 1.0]}
+
+
 def faults(**tables):
     with pytest.raises(SceneError) as caught:
         build_body(Scene.from_dict({"body": {"mass_kg": 1.0, "inertia_kg_m2": [1.0, 2.0, 2.5]}, "run": RUN} | tables))
@@ -34,6 +38,23 @@ def faults(**tables):
         ({"start": {"rotation": [[0.9, 0.5, 0], [0.5, 0.866, 0], [0, 0, 1.0]], "project": True}}, "must be below 0.1"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "disk", "radius_m": 1.0}, "inertia_kg_m2": [1.0, 1, 1]}}, "give one of"),
         ({"body": {"points": [{"mass_kg": 1.0, "position_m": [0.0, 0, 0]}], "mass_kg": 2.0}}, "mass_kg would do nothing"),
+        ({"body": {"solids": [BALL]}}, "body.solids.0: give mass_kg or density_kg_m3"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0, "density_kg_m3": 1.0}]}}, "give mass_kg or density_kg_m3, not both"),
+        ({"body": {"solids": [BALL | {"density_kg_m3": -1.0}]}}, "body.solids.0.density_kg_m3: is -1.0, must be greater than 0"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0}], "mass_kg": 2.0}}, "mass_kg would do nothing: the solids have masses"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0}], "pinned": True, "centre_of_mass_m": [0.0, 0, 1]}}, "it follows from the solids"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0}], "pinned": True, "inertia_about": "pivot"}}, "would do nothing with solids"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0}], "solid": BALL}}, "give one of solid, solids"),
+        ({"body": {"solids": []}}, "body.solids: has 0 entries, needs at least 1"),
+        ({"body": {"solids": BALL}}, "write [[body.solids]]"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0, "axis": [0.0, 0, 0]}]}}, "axis is zero"),
+        ({"body": {"solids": [CUBE | {"mass_kg": 1.0, "axis": [0.0, 0, 1]}]}}, "a cuboid may be rotated about its axis: give euler_angles_deg"),
+        ({"body": {"solids": [CUBE | {"mass_kg": 1.0, "axis": [0.0, 0, 1], "euler_angles_deg": [0.0, 1, 0]}]}}, "give axis or euler"),
+        ({"body": {"solids": [{"shape": "disk", "radius_m": 1.0, "density_kg_m3": 1.0}]}}, "a disk has no volume: give mass_kg"),
+        ({"body": {"solids": [{"shape": "cylinder", "radius_m": 1.0, "mass_kg": 1.0}]}}, "a cylinder has height_m and radius_m, not"),
+        ({"body": {"solids": [BALL | {"radius_m": 1e-90, "density_kg_m3": 1.0}]}}, "its mass is 4.18879e-270 kg"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0}]}, "fluid": {"density_kg_m3": 1.0}, "gravity": {}}, "needs a body.solid"),
+        ({"body": {"solids": [BALL | {"mass_kg": 1.0, "density": 1.0}]}}, "did you mean density_kg_m3?"),
         ({"body": {"mass_kg": 1.0, "centre_of_mass_m": [0.0, 0, 1]}}, "this one is not pinned"),
         ({"body": {"mass_kg": 1.0, "pinned": True}}, "cannot move"),
         ({"start": {"rotation": [[1.0, 0.01, 0], [0, 1, 0], [0, 0, 1]]}}, "|Q^T Q - 1| is 0.01"),
@@ -120,6 +141,22 @@ def test_all_faults_come_at_once_with_their_lines(tmp_path, capsys):
     ):  # fmt: skip
         assert part in said, part
     assert not (tmp_path / "out").exists()
+
+
+def test_all_faults_of_solids_come_at_once_with_their_lines(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        "[[body.solids]]\nshape = 'ring'\nradius_m = 1\ndensity_kg_m3 = 2\naxis = [0, 0, 0]\n\n"
+        "[[body.solids]]\nshape = 'sphere'\nradius_m = -1\nmass_kg = 2\n\n"
+        "[run]\nduration_s = 1\ntimestep_s = 0.01\n"
+    )
+    assert main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    for part in (
+        "line 1: body.solids.0: a ring has no volume: give mass_kg instead of density_kg_m3; axis is zero",
+        "line 9: body.solids.1.radius_m: is -1, must be greater than 0",
+    ):
+        assert part in said, part
 
 
 def test_the_energy_of_a_body_is_in_joule(capsys):

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import elliprd
+from scipy.spatial.transform import Rotation
 from support import COMPONENTS_PER_DIMENSION as NUMBERS
-from support import SOLIDS, added_mass_of_ellipsoid, inertia_tensor, solid
+from support import ROOT, SOLIDS, added_mass_of_ellipsoid, build_body, inertia_tensor, solid
+
+from rigidmd.scene import Scene
 
 MASS = 2.5
 DIMENSIONS = {
@@ -109,6 +112,90 @@ def test_moments_are_integrals_over_the_solid(shape):
     expected = inertia_tensor(masses, points)
     found = solid(shape, MASS, DIMENSIONS[shape]).inertia
     assert np.diag(found) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("shape", DIMENSIONS)
+def test_volumes_are_integrals_too(shape):
+    weight, _ = cloud(shape)
+    step = {"cuboid": 1.0, "ellipsoid": 2 * np.pi / 8 * np.prod(DIMENSIONS["ellipsoid"]["semi_axes_m"])}
+    unit = SOLIDS[shape]
+    volume = unit.volume * unit.scale(DIMENSIONS[shape]).prod()
+    thin = shape in ("disk", "ring", "rod")
+    assert volume == pytest.approx(0.0 if thin else weight.sum() * step.get(shape, 2 * np.pi / 8), rel=1e-12)
+
+
+# --- bodies of several solids ----------------------------------------------------------------------------------------
+
+EULER = [20.0, 50.0, -30.0]
+#: One solid of each shape, at two tilts and more.
+PARTS = [
+    {"shape": "cone", "density_kg_m3": 3.0, "axis": [1.0, 2.0, -2.0], "position_m": [0.3, -1.0, 2.0]},
+    {"shape": "cuboid", "mass_kg": 0.7, "euler_angles_deg": EULER, "position_m": [-2.0, 0.4, 0.1]},
+    {"shape": "ellipsoid", "density_kg_m3": 0.5, "euler_angles_deg": [-100.0, 130.0, 75.0]},
+    {"shape": "cylinder", "mass_kg": 1.9, "axis": [0.0, -3.0, 0.0], "position_m": [0.0, 0.0, -4.0]},
+    {"shape": "disk", "mass_kg": 0.2, "axis": [0.1, 0.2, -3.0]},
+    {"shape": "ring", "mass_kg": 0.4, "position_m": [1.0, 1.0, 1.0]},
+    {"shape": "rod", "mass_kg": 0.3, "axis": [-1.0, 0.0, 1.0], "position_m": [0.0, 2.0, 0.0]},
+    {"shape": "sphere", "density_kg_m3": 0.1, "position_m": [0.5, 0.5, -0.5]},
+]
+PARTS = [part | DIMENSIONS[part["shape"]] for part in PARTS]
+RUN = {"duration_s": 1.0, "timestep_s": 0.01}
+VOLUMES = {"cone": np.pi * 0.7**2 * 1.9 / 3, "ellipsoid": 4 / 3 * np.pi * 0.4 * 1.1 * 2.3, "sphere": 4 / 3 * np.pi * 1.3**3}
+
+
+def points_of(part):
+    """Masses and points of a solid of a body, from its cloud, by SciPy's rotations."""
+    weight, points = cloud(part["shape"])
+    mass = part.get("mass_kg") or part["density_kg_m3"] * VOLUMES[part["shape"]]
+    masses = mass * weight / weight.sum()
+    axis = np.array([part.get("axis", [0.0, 0.0, 1.0])]) / np.linalg.norm(part.get("axis", [0.0, 0.0, 1.0]))
+    rotation, _ = Rotation.align_vectors(axis, [[0.0, 0.0, 1.0]])
+    if "euler_angles_deg" in part:
+        rotation = Rotation.from_euler("ZXZ", part["euler_angles_deg"], degrees=True)
+    return masses, rotation.apply(points - masses @ points / mass) + part.get("position_m", [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("parts", [PARTS, PARTS[:2], PARTS[3:5], PARTS[6:7] * 2], ids=["all", "two", "tilted", "rods"])
+def test_a_body_of_solids_is_the_integral_over_them(parts, pinned):
+    system = build_body(Scene.from_dict({"body": {"solids": parts, "pinned": pinned}, "run": RUN}))
+    masses, points = (np.concatenate(columns) for columns in zip(*map(points_of, parts), strict=True))
+    centre = masses @ points / masses.sum()
+    assert system.mass == pytest.approx(masses.sum(), rel=1e-12)
+    assert system.centre == pytest.approx(centre if pinned else np.zeros(3), abs=1e-12)
+    tensor = system.axes @ np.diag(system.inertia) @ system.axes.T
+    expected = inertia_tensor(masses, points if pinned else points - centre)
+    assert tensor == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
+    outline = system.points[pinned:] + (0 if pinned else centre)  # the first point of a pinned body is its pivot
+    first = outline[: len(SOLIDS[parts[0]["shape"]].outline)] - parts[0]["position_m"]
+    if "axis" in parts[0]:  # reaches as far along its axis as it is long
+        height = DIMENSIONS[parts[0]["shape"]].get("height_m", DIMENSIONS[parts[0]["shape"]].get("length_m"))
+        axis = np.array(parts[0]["axis"]) / np.linalg.norm(parts[0]["axis"])
+        assert np.ptp(first @ axis) == pytest.approx(height, rel=1e-12)
+        if parts[0]["shape"] == "cone":
+            assert (first @ axis).min() == pytest.approx(-0.75 * height, rel=1e-12)  # from its tip to its base
+
+
+def test_a_t_handle_has_the_moments_of_its_two_cylinders():
+    system = build_body(Scene.read(ROOT / "systems" / "t_handle.toml"))
+    (m, r, h), (n, s, k) = (2700 * np.pi * 0.006**2 * 0.08, 0.006, 0.08), (2700 * np.pi * 0.005**2 * 0.05, 0.005, 0.05)
+    reduced = m * n / (m + n) * 0.031**2
+    along, across = m * r * r / 2, m * (3 * r * r + h * h) / 12
+    expected = [along + n * (3 * s * s + k * k) / 12 + reduced, across + n * s * s / 2,
+                across + n * (3 * s * s + k * k) / 12 + reduced]  # fmt: skip
+    assert system.mass == pytest.approx(m + n, rel=1e-14)
+    assert system.inertia == pytest.approx(expected, rel=1e-13)
+    assert (system.axes == np.eye(3)).all()
+
+
+def test_one_solid_among_solids_is_the_solid():
+    one = {"shape": "cone", "radius_m": 0.03, "height_m": 0.06}
+    table = {"mass_kg": 0.2, "solid": one, "pinned": True, "centre_of_mass_m": [0.0, 0.0, 0.045]}
+    parts = {"solids": [one | {"mass_kg": 0.2, "position_m": [0.0, 0.0, 0.045]}], "pinned": True}
+    single, several = (build_body(Scene.from_dict({"body": body, "run": RUN})) for body in (table, parts))
+    assert several.inertia == pytest.approx(single.inertia, rel=1e-15)
+    assert several.points == pytest.approx(single.points, abs=1e-17)
+    assert several.inertia[0] == several.inertia[1]
 
 
 @pytest.mark.parametrize("shape", DIMENSIONS)

@@ -17,6 +17,7 @@ from PIL import Image, ImageSequence
 from support import ROOT, SOLIDS, UNITS, build_body, connections, mesh_of, molecule_film, read_record, solid, write_film
 
 from rigidmd import Scene, Simulation
+from rigidmd.mechanics.inertia import shifted_inertia
 from rigidmd.commands import cli
 
 CHROMIUM = next(
@@ -459,6 +460,32 @@ def test_a_scene_chooses_what_a_body_is_drawn_as(drawn_as, about):
         assert np.allclose(np.diag(tensor), [0.66e-4, 0.66e-4, 1.2e-4], rtol=0.06)
 
 
+CYLINDER = {"shape": "cylinder", "radius_m": 1.0, "height_m": 2.0, "axis": [1.0, -1.0, 0.5], "mass_kg": 1.0}
+TILTED = [
+    {"shape": "cuboid", "lengths_m": [0.3, 1.0, 2.0], "euler_angles_deg": [20.0, 50.0, -30.0], "density_kg_m3": 1.0},
+    {"shape": "cone", "radius_m": 0.5, "height_m": 1.5, "axis": [1.0, 2.0, -2.0], "density_kg_m3": 1.0,
+     "position_m": [1.0, -1.0, 2.0]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("solids", [None, TILTED], ids=["handle", "tilted"])
+def test_a_body_of_solids_is_drawn_as_its_solids(solids, pinned):
+    """Of one density, the drawn surface has the centre and the inertia of the body."""
+    parts = {} if solids is None else {"body.solids": solids}
+    system = build_body(Scene.read(ROOT / "systems" / "t_handle.toml", parts | {"body.pinned": pinned}))
+    mesh = mesh_of(system)
+    assert mesh.about == "its solids"
+    place, tensor = inertia_of_mesh(mesh, system.mass)
+    assert np.allclose(place, system.centre, atol=0.01 * mesh.reach)
+    known = system.axes @ np.diag(system.inertia) @ system.axes.T
+    known = shifted_inertia(known, -system.mass, system.centre)
+    assert np.allclose(tensor, known, atol=0.04 * known.max())
+    corners = [mesh.vertices[face] for face in mesh.faces]  # short, as those at the back are drawn first
+    sides = [np.linalg.norm(np.roll(face, -1, axis=0) - face, axis=1).max() for face in corners if len(face) == 4]
+    assert max(sides) < 0.16 * mesh.reach
+
+
 @pytest.mark.parametrize(
     ("sets", "expected"),
     [
@@ -552,6 +579,8 @@ def test_a_body_has_its_edges_as_bonds(tmp_path):
         ({"mass_kg": 1.0, "solid": {"shape": "cylinder", "radius_m": 1.0, "height_m": 2.0}}, 36),
         ({"mass_kg": 1.0, "solid": {"shape": "ring", "radius_m": 1.0}}, 24),
         ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, 12),
+        ({"solids": [CYLINDER, CYLINDER | {"position_m": [0.0, 5.0, 0.0]}]}, 36 + 1 + 36),
+        ({"solids": [CYLINDER, TILTED[0], TILTED[0] | {"position_m": [9.0, 0.0, 0.0]}], "pinned": True}, 1 + 36 + 2 + 24),
         ({"points": [{"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)]}, 3),
     ],
 )

@@ -1,7 +1,7 @@
 """The system of a scene of a single body, and errors of keys that do not apply to the body or have no effect on it."""
 
 # isort: skip_file
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations
 
 import numpy as np
@@ -17,7 +17,9 @@ from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentF
 from rigidmd.forces.body.resistance import NoResistance, Resistance
 from rigidmd.io.formats import format_of
 from rigidmd.mechanics.free_rotor import DrivenRotor, NoRotor, split_rotor
-from rigidmd.mechanics.inertia import added_mass_of_ellipsoid, inertia_tensor, shifted_inertia, solid
+from rigidmd.mechanics.inertia import (
+    Assembly, Part, added_mass_of_ellipsoid, assemble_solids, inertia_tensor, shifted_inertia, solid,
+)  # fmt: skip
 from rigidmd.mechanics.rotation import unit_vector
 from rigidmd.mechanics.time_functions import (
     TimeFunction, constant_function, has_constant_direction, integrate_function, interpolated_function,
@@ -25,7 +27,7 @@ from rigidmd.mechanics.time_functions import (
 )  # fmt: skip
 from rigidmd.mechanics.translation import FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame
 from rigidmd.scene import BodyScene
-from rigidmd.scene.body import axis_of_symmetry
+from rigidmd.scene.body import SolidPart, axis_of_symmetry
 from rigidmd.scene.body_forces import Fluid, Friction, Timed
 from rigidmd.scene.validation import not_none
 
@@ -212,7 +214,7 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
     """Mass, inertia tensor about the centre of mass or pivot, its position, points to draw, names of the points."""
     body = scene.body
     centre = np.array(body.centre_of_mass_m or (0.0, 0.0, 0.0))
-    mass = body.mass_kg or 0.0  # with points: their sum, below
+    mass = body.mass_kg or 0.0  # with points or solids: their sum, below
     tensor = np.zeros((3, 3)) if body.tensor is None else body.tensor
     if body.points is not None:
         masses = np.array([p.mass_kg for p in body.points])
@@ -221,6 +223,9 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
         centre = masses @ positions / mass
         points = positions - centre
         tensor = inertia_tensor(masses, points)
+    elif body.solids is not None:
+        mass, centre, tensor, outlines = assembled(body.solids)
+        points = np.concatenate(outlines)
     elif body.solid is not None:
         shape = solid(body.solid.shape, mass, body.solid.dimensions)
         points, tensor = shape.outline, np.diag(shape.inertia)
@@ -233,6 +238,16 @@ def inertia_of(scene: BodyScene) -> tuple[float, np.ndarray, np.ndarray, np.ndar
         points = np.vstack([np.zeros(3), centre + points])
         return mass, tensor, centre, points, ("PIVOT", *(f"P{k}" for k in range(1, len(points))))
     return mass, tensor, np.zeros(3), points, tuple(f"P{k}" for k in range(1, len(points) + 1))
+
+
+def assembled(solids: Sequence[SolidPart]) -> Assembly:
+    """The body of [[body.solids]], in their axes."""
+    return assemble_solids(
+        [
+            Part(part.mass, solid(part.shape, part.mass, part.dimensions), np.array(part.position_m), part.rotation)
+            for part in solids
+        ]
+    )
 
 
 def inertia_at_centre(scene: BodyScene) -> np.ndarray:

@@ -9,9 +9,9 @@ from rigidmd.compile.kernels import compile_user_function
 from rigidmd.dynamics.thermostats import apply_thermostat
 from rigidmd.forces.terms import add_forces
 
-#: The registered classes.
-FORCES: set[type] = set()
-THERMOSTATS: set[type] = set()
+#: The registered classes, and the function of each.
+FORCES: dict[type, Callable[..., Any]] = {}
+THERMOSTATS: dict[type, Callable[..., Any]] = {}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -43,7 +43,7 @@ def compiled_force(kind: type) -> Callable[[Function], Function]:
     def register(function: Function) -> Function:
         _check_arguments(function, ("term", "state", "load", "tally"))
         compiled = compile_user_function(function)
-        FORCES.add(kind)
+        FORCES[kind] = function
         implements(add_forces, kind)(lambda term, state, load, tally: compiled(term, state, load, tally))
         return function
 
@@ -59,15 +59,21 @@ def compiled_thermostat(kind: type) -> Callable[[Function], Function]:
     The function changes `state.velocity` and `state.angular_momentum_body` over a time h (ps), and adds the change of
     the kinetic energy to `state.energy_ledger[0]`, so that energy less heat is conserved. It acts half before and half
     after each step (`halved = False` in the class: all of it after the step); with integrator = "baoab" in its middle.
-    `draw` is for counted random numbers (`rigidmd.dynamics.noise`). `changes_momentum = True` in the class means that
-    it changes the total momentum.
+
+    model : `rigidmd.dynamics.model.Model`; masses and moments are by species, `model.mass[model.species[m]]`
+    state : `rigidmd.core.state.State`
+    draw : an integer, the first of the random numbers of this call. `rigidmd.dynamics.noise` has
+        `normals(thermostat.key, draw, m, state.step[0])`, two normal numbers for molecule m; draw + 1, ... gives more.
+        The key is a field of the class, from `key_of(seed, THERMOSTAT, stage)`
+
+    `changes_momentum = True` in the class means that it changes the total momentum.
     """
     _check_class(kind)
 
     def register(function: Function) -> Function:
         _check_arguments(function, ("thermostat", "model", "state", "h", "draw"))
         compiled = compile_user_function(function)
-        THERMOSTATS.add(kind)
+        THERMOSTATS[kind] = function
 
         @implements(apply_thermostat, kind)
         def _apply(thermostat, model, code, state, workspace, h, draw):

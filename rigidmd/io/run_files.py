@@ -50,6 +50,13 @@ class StageSummary(BaseModel):
     ns_per_day: Bounded | None = None
 
 
+class RateSummary(BaseModel):
+    """A rate of the motion of a body in summary.json."""
+
+    measured: Bounded | None = None
+    theory: Bounded | None = None
+
+
 class Summary(BaseModel):
     """The part of summary.json that is read, for molecules and bodies, by any version."""
 
@@ -58,6 +65,7 @@ class Summary(BaseModel):
     interrupted: Flag = False
     notes: list[str] = []
     stages: list[StageSummary] = []
+    rates: dict[str, RateSummary] = {}
     scene_sha256: str | None = None
     input_sha256: dict[str, str] = {}
     processor_features: list[str] = []

@@ -117,12 +117,20 @@ class Shape(NamedTuple):
 
     dimensions: the axes (0, 1, 2) that each dimension scales, by the name of the dimension in a scene; the solid is
     thin along an axis without a dimension. mean_squares (3,): <x²>, <y²>, <z²> over its mass. outline (k, 3): points on
-    its surface.
+    its surface. volume: 0 for a thin solid.
     """
 
     dimensions: dict[str, list[int]]
     mean_squares: tuple[float, float, float]
     outline: np.ndarray
+    volume: float
+
+    def scale(self, dimensions: Mapping[str, float | Sequence[float]]) -> np.ndarray:
+        """Factors (3,) of the unit solid along its axes; 0 along an axis without a dimension."""
+        factors = np.zeros(3)
+        for name, axes in self.dimensions.items():
+            factors[axes] = dimensions[name]
+        return factors
 
 
 #: Number of components of each dimension.
@@ -146,22 +154,25 @@ SOLIDS = {
         {"radius_m": [0, 1], "height_m": [2]},
         (1 / 4, 1 / 4, 1 / 12),
         _outline((1, 0, -0.5), (12, 1, -0.5), (12, 1, 0.5), (1, 0, 0.5)),
+        np.pi,
     ),
     "cone": Shape(
         {"radius_m": [0, 1], "height_m": [2]},
         (3 / 20, 3 / 20, 3 / 80),
         _outline((1, 0, -0.75), (8, 0.5, -0.25), (16, 1, 0.25), (1, 0, 0.25)),
+        np.pi / 3,
     ),
-    "sphere": Shape({"radius_m": [0, 1, 2]}, (1 / 5, 1 / 5, 1 / 5), _BALL),
+    "sphere": Shape({"radius_m": [0, 1, 2]}, (1 / 5, 1 / 5, 1 / 5), _BALL, 4 / 3 * np.pi),
     "cuboid": Shape(
         {"lengths_m": [0, 1, 2]},
         (1 / 12, 1 / 12, 1 / 12),
         np.array([point for point in product([-0.5, 0, 0.5], repeat=3) if any(point)]),
+        1.0,
     ),
-    "ellipsoid": Shape({"semi_axes_m": [0, 1, 2]}, (1 / 5, 1 / 5, 1 / 5), _BALL),
-    "disk": Shape({"radius_m": [0, 1]}, (1 / 4, 1 / 4, 0), _outline((1, 0, 0), (8, 0.5, 0), (16, 1, 0))),
-    "ring": Shape({"radius_m": [0, 1]}, (1 / 2, 1 / 2, 0), _outline((24, 1, 0))),
-    "rod": Shape({"length_m": [2]}, (0, 0, 1 / 12), _outline(*((1, 0, z) for z in np.linspace(-0.5, 0.5, 13)))),
+    "ellipsoid": Shape({"semi_axes_m": [0, 1, 2]}, (1 / 5, 1 / 5, 1 / 5), _BALL, 4 / 3 * np.pi),
+    "disk": Shape({"radius_m": [0, 1]}, (1 / 4, 1 / 4, 0), _outline((1, 0, 0), (8, 0.5, 0), (16, 1, 0)), 0.0),
+    "ring": Shape({"radius_m": [0, 1]}, (1 / 2, 1 / 2, 0), _outline((24, 1, 0)), 0.0),
+    "rod": Shape({"length_m": [2]}, (0, 0, 1 / 12), _outline(*((1, 0, z) for z in np.linspace(-0.5, 0.5, 13))), 0.0),
 }
 
 
@@ -172,11 +183,43 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
     dimensions : all dimensions of that shape, each with COMPONENTS_PER_DIMENSION numbers
     """
     unit = SOLIDS[shape]
-    scale = np.zeros(3)
-    for name, axes in unit.dimensions.items():
-        scale[axes] = dimensions[name]
+    scale = unit.scale(dimensions)
     spread = mass * scale**2 * unit.mean_squares
     return Solid(spread[[1, 2, 0]] + spread[[2, 0, 1]], unit.outline * scale)
+
+
+class Part(NamedTuple):
+    """A solid of a body: its mass, its own `Solid`, the position (3,) of its centre of mass and its rotation (3, 3), from
+    its principal axes to the axes of the body."""
+
+    mass: float
+    solid: Solid
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+class Assembly(NamedTuple):
+    """A body of several solids, along the body's axes: mass, centre of mass (3,), inertia tensor (3, 3) about it, and the
+    outline (k, 3) of each solid from it."""
+
+    mass: float
+    centre: np.ndarray
+    tensor: np.ndarray
+    outlines: list[np.ndarray]
+
+
+def assemble_solids(parts: Sequence[Part]) -> Assembly:
+    """The rigid body of solids, whose masses and inertia add up, by the parallel axis theorem. Where solids overlap, both
+    masses are there."""
+    masses, positions = np.array([part.mass for part in parts]), np.array([part.position for part in parts])
+    mass = float(masses.sum())
+    centre = masses @ positions / mass
+    tensor, outlines = np.zeros((3, 3)), []
+    for part in parts:
+        own = part.rotation @ np.diag(part.solid.inertia) @ part.rotation.T
+        tensor += shifted_inertia(own, part.mass, part.position - centre)
+        outlines.append(part.position - centre + part.solid.outline @ part.rotation.T)
+    return Assembly(mass, centre, 0.5 * (tensor + tensor.T), outlines)
 
 
 def added_mass_of_ellipsoid(semi_axes: ArrayLike, density: float) -> tuple[np.ndarray, np.ndarray]:

@@ -55,6 +55,16 @@ def from_vector(vector: np.ndarray) -> np.ndarray:
     return from_quaternion(np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1))
 
 
+def from_axis(direction: ArrayLike) -> np.ndarray:
+    """The smallest rotation (3, 3) that takes axis 3 to a direction (3,) of any length; from -3 by half a turn about
+    axis 1. It has no rounding for a direction along an axis."""
+    x, y, z = unit_vector(direction)
+    if z < 0:
+        return from_axis((-x, -y, -z)) @ np.diag([1.0, -1.0, -1.0])
+    tilt = hat(np.array([-y, x, 0.0]))
+    return np.eye(3) + tilt + tilt @ tilt / (1 + z)
+
+
 def from_euler_angles(euler_angles: np.ndarray) -> np.ndarray:
     """Q = Rz(phi) Rx(theta) Rz(psi) (..., 3, 3) of 3-1-3 Euler angles (..., 3) = (phi, theta, psi)."""
     (cf, ct, cp), (sf, st, sp) = _cosines_and_sines(euler_angles)

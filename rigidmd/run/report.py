@@ -1,5 +1,6 @@
 """The summary of a run as text."""
 
+import math
 from collections.abc import Container, Sequence
 
 from rigidmd.core.statistics import NO_ERROR, format_signed, format_with_error
@@ -57,6 +58,26 @@ def body_title(summary: dict) -> str:
     return f"{summary['steps']} steps of {summary['timestep_s']:g} s, {summary['duration_s']:g} s{speed}"
 
 
+#: Name of a rate of a body -> its name in reports, and how it is written with a number.
+RATES = {
+    "precession_rad_s": ("precession", "{} rad/s about the vertical"),
+    "precession_about_L_rad_s": ("precession", "{} rad/s about L"),
+    "nutation_period_s": ("nutation", "every {} s"),
+    "spin_rad_s": ("spin", "{} rad/s about the axis of symmetry"),
+    "omega_period_s": ("omega", "returns in the body every {} s"),
+    "flip_interval_s": ("flips", "every {} s"),
+}
+
+
+def _rate(rate: dict, pattern: str) -> str:
+    """A rate as measured and by theory."""
+    measured, theory = rate.get("measured"), rate.get("theory")
+    if measured is None:
+        theory = math.nan if theory is None else theory
+        return f"{pattern.format(f'{theory:.7g}')} in theory; fewer than two periods in the samples, or too few samples"
+    return pattern.format(f"{measured:.7g}") + ("" if theory is None else f"; in theory {theory:.7g}")
+
+
 def body_rows(summary: dict) -> list[tuple[str, str]]:
     """Names and values of the summary of a run of a single body."""
     rows = [("energy", f"{summary['energy_start_J']:.12g} J at the start, {summary['energy_end_J']:.12g} J at the end")]
@@ -65,6 +86,7 @@ def body_rows(summary: dict) -> list[tuple[str, str]]:
     if summary["theta_range_deg"]:
         low, high = summary["theta_range_deg"]
         rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
+    rows += [(RATES[name][0], _rate(rate, RATES[name][1])) for name, rate in summary.get("rates", {}).items() if name in RATES]
     for name, error in summary["largest_relative_error"].items():
         of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
         rows.append((f"{name} error", f"at most {error:.1e} of {of}"))

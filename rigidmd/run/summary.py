@@ -13,6 +13,7 @@ from rigidmd.engines.body_motion import Motion
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.engines.samples import COLUMNS, LEAST_SAMPLES, Sample, Samples, describe_equilibrated, equilibrated
 from rigidmd.engines.system import System
+from rigidmd.run.body_rates import body_rates
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
@@ -349,7 +350,9 @@ def summarise_body(
         "formulation": getattr(system.method, "formulation", None), "timestep_s": run.timestep_s, "steps": steps,
         "duration_s": end, "samples": len(motion), "preparing_s": preparing, "wall_s": wall,
         "computing_s": computing, "steps_per_s": steps / computing if computing > 0 else None,
-        **motion_figures(motion.columns, motion.invariants), "trajectory_A_per_m": system.scale, "notes": notes,
+        **motion_figures(motion.columns, motion.invariants),
+        "rates": {name: rate._asdict() for name, rate in body_rates(system, motion).items()},
+        "trajectory_A_per_m": system.scale, "notes": notes,
     }  # fmt: skip
 
 

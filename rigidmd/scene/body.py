@@ -13,8 +13,8 @@ from rigidmd.core.integrators import AUTO, FORMULATIONS, SCHEMES, SOLVERS, WITH_
 from rigidmd.io.formats import BODY_TOPOLOGY, TRAJECTORY
 from rigidmd.mechanics.inertia import COMPONENTS_PER_DIMENSION, SOLIDS, inertia_error, shifted_inertia
 from rigidmd.mechanics.rotation import (
-    angular_velocity_of_euler_rates, from_attitude_matrix, from_euler_angles, from_quaternion, from_yaw_pitch_roll,
-    nearest_rotation, orthogonality_error, unit_vector,
+    angular_velocity_of_euler_rates, from_attitude_matrix, from_axis, from_euler_angles, from_quaternion,
+    from_yaw_pitch_roll, nearest_rotation, orthogonality_error, unit_vector,
 )  # fmt: skip
 from rigidmd.scene.base import Scene, file_name
 from rigidmd.scene.body_forces import (
@@ -23,6 +23,7 @@ from rigidmd.scene.body_forces import (
 from rigidmd.scene.integrators import MovedByScheme
 from rigidmd.scene.validation import (
     MOST_TABLES, Flag, Limit, LimitOfEnergy, LimitOfRounding, NameIn, Number, Positive, Section, Vector, location_of,
+    not_none,
 )  # fmt: skip
 
 
@@ -34,7 +35,11 @@ LARGEST_ORTHOGONALITY_ERROR = 1e-9
 FURTHEST_FROM_ROTATION = 0.1
 MOST_STEPS = 1e12
 #: Keys of [body] that give the inertia, of which a body has at most one.
-WAYS_OF_INERTIA = ("solid", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
+WAYS_OF_INERTIA = ("solid", "solids", "points", "inertia_kg_m2", "inertia_tensor_kg_m2")
+#: Those of them that are tables of parts with masses and positions.
+PARTS = ("solids", "points")
+#: Solids that are not symmetric about axis 3 for all dimensions, so that a direction does not fix their orientation.
+WITHOUT_AXIS = ("cuboid", "ellipsoid")
 
 #: Moments of inertia are equal, for a picture, if they differ by less than this fraction of the largest.
 EQUAL_MOMENTS = 1e-6
@@ -73,6 +78,55 @@ class Solid(Section):
             yield f"a {self.shape} has {' and '.join(sorted(wanted))}, not {' and '.join(sorted(given)) or 'none'}"
 
 
+class SolidPart(Solid):
+    """A homogeneous solid of a body made of several. Where two overlap, the masses of both are there."""
+
+    mass_kg: Positive | None = None
+    """Mass of this solid"""
+    density_kg_m3: Positive | None = None
+    """Density of this solid, instead of its mass"""
+    position_m: Vector = (0.0, 0.0, 0.0)
+    """Position of its centre of mass, along the body axes, from any origin; from the pivot if the body is pinned"""
+    axis: Vector | None = None
+    """Direction of its axis 3, along the body axes, of any length; of a cone from its tip to its base; default: axis 3
+    of the body"""
+    euler_angles_deg: Vector | None = None
+    """Its orientation in the body axes: phi, theta, psi (3-1-3), x_body = Rz(phi) Rx(theta) Rz(psi) x_solid"""
+
+    def _errors(self):
+        faults = [*super()._errors()]
+        ways = [key for key in ("mass_kg", "density_kg_m3") if getattr(self, key) is not None]
+        if len(ways) != 1:
+            faults.append("give mass_kg or density_kg_m3" + (", not both" if ways else ""))
+        elif ways == ["density_kg_m3"] and SOLIDS[self.shape].volume == 0:
+            faults.append(f"a {self.shape} has no volume: give mass_kg instead of density_kg_m3")
+        elif not faults and not Scene.SIZES[0] <= self.mass <= Scene.SIZES[1]:
+            faults.append(f"its mass is {self.mass:g} kg, must be between {Scene.SIZES[0]:g} and {Scene.SIZES[1]:g}")
+        if self.axis is not None and self.euler_angles_deg is not None:
+            faults.append("give axis or euler_angles_deg, not both")
+        elif self.axis is not None and self.shape in WITHOUT_AXIS:
+            rotation = f"{'an' if self.shape == 'ellipsoid' else 'a'} {self.shape} may be rotated about its axis"
+            faults.append(f"axis is not enough, as {rotation}: give euler_angles_deg")
+        elif self.axis is not None and not any(self.axis):
+            faults.append("axis is zero, which is not a direction")
+        return faults
+
+    @property
+    def mass(self) -> float:
+        """Its mass, kg."""
+        if self.mass_kg is not None:
+            return self.mass_kg
+        shape = SOLIDS[self.shape]
+        return not_none(self.density_kg_m3) * shape.volume * float(shape.scale(self.dimensions).prod())
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Rotation (3, 3) from the axes of the solid to those of the body."""
+        if self.euler_angles_deg is not None:
+            return from_euler_angles(np.radians(self.euler_angles_deg))
+        return from_axis(self.axis or (0.0, 0.0, 1.0))
+
+
 class PointMass(Section):
     """A point of a body made of points."""
 
@@ -86,9 +140,11 @@ class BodyTable(Section):
     """The body: mass, inertia and pivot. Without inertia it is a point."""
 
     mass_kg: Positive | None = None
-    """Mass; with points the sum of their masses"""
+    """Mass; with solids or points the sum of their masses"""
     solid: Solid | None = None
     """Inertia of a homogeneous solid"""
+    solids: tuple[SolidPart, ...] | None = Field(default=None, min_length=1, max_length=MOST_TABLES)
+    """Inertia of several homogeneous solids, joined"""
     points: tuple[PointMass, ...] | None = Field(default=None, min_length=1)
     """Inertia of point masses"""
     inertia_kg_m2: NonNegativeVector | None = None
@@ -104,20 +160,21 @@ class BodyTable(Section):
 
     def _errors(self):
         ways = [key for key in WAYS_OF_INERTIA if getattr(self, key)]
-        has_points, has_centre = self.points is not None, self.centre_of_mass_m is not None
+        parts = "".join(key for key in PARTS if getattr(self, key))
+        has_parts, has_centre = bool(parts), self.centre_of_mass_m is not None
         about_pivot, has_mass = self.inertia_about == "pivot", self.mass_kg is not None
         faults = {
             f"give one of {', '.join(ways)}": len(ways) > 1,
-            "mass_kg is missing": not (has_points or has_mass),
-            "mass_kg would do nothing: the points have masses": has_points and has_mass,
+            "mass_kg is missing": not (has_parts or has_mass),
+            f"mass_kg would do nothing: the {parts} have masses": has_parts and has_mass,
             "centre_of_mass_m is for a pinned body, from its pivot; this one is not pinned": (
                 has_centre and not self.pinned
             ),
-            "centre_of_mass_m would do nothing: it follows from the points": has_centre and has_points,
+            f"centre_of_mass_m would do nothing: it follows from the {parts}": has_centre and has_parts,
             "inertia_about = 'pivot', but no inertia is given": about_pivot and not ways,
             "inertia_about = 'pivot', but the body is not pinned": about_pivot and not self.pinned,
             f"inertia_about would do nothing with {''.join(ways[:1])}": (
-                about_pivot and ways[:1] in (["solid"], ["points"])
+                about_pivot and ways[:1] in (["solid"], ["solids"], ["points"])
             ),
         }
         found, tensor = [fault for fault, is_there in faults.items() if is_there], self.tensor
@@ -297,7 +354,7 @@ class BodyOutput(Section):
     drawn_as: Literal["top", "ellipsoid", "cuboid"] | Solid | None = None
     """Shape in animations and pages; no effect on the motion. "top", "ellipsoid" or "cuboid" with the mass and inertia
     of the body, or a solid with its dimensions, such as { shape = "cone", radius_m = 0.03, height_m = 0.06 }. Default:
-    the solid or the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if
+    the solids or the points of the body; else a cylinder or ball of its inertia if two moments are equal, on a stem if
     it is pinned outside; else a cuboid"""
 
     def _errors(self):

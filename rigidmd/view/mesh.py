@@ -1,11 +1,11 @@
-"""The surface of a single body for drawings: its solid, its points joined by rods, or a solid of the same inertia."""
+"""The surface of a single body for drawings: its solids, its points joined by rods, or a solid of the same inertia."""
 
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.body import inertia_at_centre, inertia_of, principal
+from rigidmd.assemble.body import assembled, inertia_at_centre, inertia_of, principal
 from rigidmd.engines.body_system import BodySystem
 from rigidmd.figures.style import camera
 from rigidmd.io.formats.bonds import shortest_links
@@ -14,6 +14,8 @@ from rigidmd.scene.body import EQUAL_MOMENTS, Solid, axis_of_symmetry
 
 #: Corners of a circle; least thickness of a body, as a fraction of its reach.
 CIRCLE_CORNERS, MIN_THICKNESS = 24, 0.02
+#: Longest side of a face of joined solids, as a fraction of the body's reach.
+LONGEST_FACE = 0.15
 #: Edges of a cuboid in half axes of the ellipsoid of the same inertia; thickness of a stem in its length.
 CUBOID_EDGES, STEM_THICKNESS = (12 / 5) ** 0.5, 0.06
 EQUAL = "of the same mass and inertia"
@@ -35,7 +37,7 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(system: BodySystem) -> Mesh:
-    """The surface of a body: as the scene requests, its solid, its points joined, or a body of equal inertia."""
+    """The surface of a body: as the scene requests, its solids, its points joined, or a body of equal inertia."""
     table, scene = system.scene.body, system.scene
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
@@ -47,6 +49,14 @@ def mesh_of(system: BodySystem) -> Mesh:
         return _solid_mesh(wanted, np.array([0.0, 0.0, 0.75 * (wanted.height_m or 0.0)]) if stands else centre)
     if wanted is None and table.solid is not None:
         return _solid_mesh(table.solid, centre)
+    if wanted is None and table.solids is not None:
+        origin = np.zeros(3) if table.pinned else assembled(table.solids).centre
+        surfaces = [_solid_mesh(part, np.zeros(3)) for part in table.solids]
+        placed = [
+            surface._replace(vertices=surface.vertices @ part.rotation.T + part.position_m - origin)
+            for surface, part in zip(surfaces, table.solids, strict=True)
+        ]
+        return _cut(_joined(placed, "its solids"))
     # a homogeneous body of this mass and inertia: a solid of revolution if two moments are equal, or else a cuboid
     tensor = inertia_at_centre(scene)
     if not tensor.any():
@@ -121,12 +131,41 @@ def _points_mesh(positions: np.ndarray, masses: np.ndarray) -> Mesh:
         frame *= [[0.02 * size], [0.02 * size], [np.linalg.norm(along)]]
         vertices = CYLINDER.vertices @ frame + (positions[i] + positions[j]) / 2
         parts.append(CYLINDER._replace(vertices=vertices, painted=[False] * len(CYLINDER.faces)))
+    return _joined(parts, "its points, joined")
+
+
+def _joined(parts: list[Mesh], about: str) -> Mesh:
+    """Several surfaces as one."""
     faces, painted, start = [], [], 0
     for part in parts:
         faces += [[start + corner for corner in face] for face in part.faces]
         painted += part.painted
         start += len(part.vertices)
-    return Mesh(np.concatenate([part.vertices for part in parts]), faces, painted, "its points, joined")
+    return Mesh(np.concatenate([part.vertices for part in parts]), faces, painted, about)
+
+
+def _cut(mesh: Mesh) -> Mesh:
+    """The same surface with long faces of four corners in pieces. Faces are drawn from the furthest to the nearest, which
+    is right where solids meet only if they are short."""
+    longest = LONGEST_FACE * mesh.reach
+    vertices, faces, painted = [*mesh.vertices], [], []
+    for face, color in zip(mesh.faces, mesh.painted, strict=True):
+        corners = mesh.vertices[face]
+        sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+        along, across = (max(1, int(np.ceil(max(sides[k::2]) / longest))) for k in (0, 1))
+        if len(face) != 4 or along * across == 1:
+            faces.append(face)
+            painted.append(color)
+            continue
+        u, v = np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, across + 1), indexing="ij")
+        weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
+        first, row = len(vertices), across + 1
+        vertices += [*(weights @ corners).reshape(-1, 3)]
+        for i, j in product(range(along), range(across)):
+            corner = first + row * i + j
+            faces.append([corner, corner + row, corner + row + 1, corner + 1])
+            painted.append(color)
+    return mesh._replace(vertices=np.array(vertices), faces=faces, painted=painted)
 
 
 def _revolve(rings: list[tuple[float, float]], closed: bool = False) -> Mesh:

@@ -120,7 +120,8 @@ def _body_table(record: Record) -> str:
     of_invariants = BODY["energy_error"].names + BODY["L_error"].names
     errors = [name.removesuffix("_error") for name in record.columns if name in of_invariants]
     time = ("time", f"{record.time[-1]:g} s, {len(record.time)} samples")
-    return table([], [time, *body_rows(motion_figures(record.columns, errors))], words=True)
+    found = motion_figures(record.columns, errors) | {"rates": (record.summary or {}).get("rates", {})}
+    return table([], [time, *body_rows(found)], words=True)
 
 
 def _margins(record: Record) -> str:

@@ -3,9 +3,12 @@
 A system is an `engines.system.System` or an `engines.body_system.BodySystem`, a molecule a `scene.models.Molecule`.
 """
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+
+from rigidmd.mechanics.inertia import SOLIDS
 
 #: Difference of the normals of two triangles of one flat side of a hull. Thickness relative to the size below which
 #: points lie in a plane or on a line.
@@ -13,17 +16,22 @@ FLAT, THIN = 1e-6, 1e-9
 
 
 def connections(system: Any, massless: bool = False) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull of a solid or the
-    shortest links between points, with a link from a pinned body to its pivot. `massless`: whether massless sites are
-    joined to their nearest atoms, so that each molecule is connected."""
+    """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull of each solid or the
+    shortest links between points, with links between solids and from a pinned body to its pivot. `massless`: whether
+    massless sites are joined to their nearest atoms, so that each molecule is connected."""
     if hasattr(system, "species"):
         starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
         chosen = [[pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species]
         links = [np.array(pairs, int).reshape(-1, 2) for pairs in chosen]
         return np.concatenate([start + links[kind] for start, kind in zip(starts, system.model.species, strict=True)])
     first = 0 if system.translates else 1  # the pivot is the first point
-    points = system.points[first:]
-    pairs = first + (shortest_links(points) if system.scene.body.points is not None else _hull(points))
+    points, body = system.points[first:], system.scene.body
+    if body.points is not None:
+        pairs = first + shortest_links(points)
+    elif body.solids is not None:
+        pairs = first + _edges_of_solids(points, [len(SOLIDS[part.shape].outline) for part in body.solids])
+    else:
+        pairs = first + _hull(points)
     if first and len(points):
         nearest = int(np.linalg.norm(points - system.centre, axis=1).argmin())
         pairs = np.vstack([[0, first + nearest], pairs])
@@ -42,6 +50,26 @@ def shortest_links(points: np.ndarray) -> np.ndarray:
 
     tree = minimum_spanning_tree(cdist(points, points)).tocoo()
     return np.stack([tree.row, tree.col], axis=-1)
+
+
+def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
+    """Edges (b, 2) of the hulls of solids, whose points follow one another, and the shortest links that join the solids.
+
+    counts : number of points of each solid
+    """
+    from scipy.spatial.distance import cdist
+
+    starts = np.cumsum([0, *counts])
+    edges = [start + _hull(points[start:end]) for start, end in pairwise(starts.tolist())]
+    joined, free = np.arange(starts[1]), np.arange(starts[1], len(points))
+    while len(free):
+        distance = cdist(points[joined], points[free])
+        i, j = np.unravel_index(distance.argmin(), distance.shape)
+        edges.append(np.array([[joined[i], free[j]]]))
+        solid = int(np.searchsorted(starts, free[j], side="right")) - 1
+        new = np.arange(starts[solid], starts[solid + 1])
+        joined, free = np.concatenate([joined, new]), np.setdiff1d(free, new)
+    return np.concatenate(edges)
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
