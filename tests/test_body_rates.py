@@ -31,7 +31,9 @@ def rates(scene, **more):
 
 
 def shipped(name, **changes):
-    return rigidmd.Scene.read(SYSTEMS / f"{name}.toml", {key.replace("__", "."): value for key, value in changes.items()})
+    return rigidmd.Scene.read(
+        SYSTEMS / f"{name}.toml", {key.replace("__", "."): value for key, value in changes.items()}
+    )
 
 
 @pytest.mark.parametrize("spin", [0.01, -0.02, 0.3])

@@ -15,6 +15,7 @@ import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Every, Simulation
+from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"
@@ -22,6 +23,7 @@ SHORT = ["--set", "run.duration_s=0.05"]
 
 
 def read(path):
+    """motion.csv: the columns by their headers, of which the first word is the name."""
     with path.open() as file:
         rows = list(csv.reader(file))
     return dict(zip(rows[0], np.array(rows[1:], dtype=float).T, strict=True))
@@ -40,18 +42,29 @@ def test_a_run_leaves_what_it_promises(tmp_path, capsys):
     assert (folder / "axis.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (folder / "axis.svg").read_bytes()[:1000]
     columns = read(folder / "motion.csv")
-    wanted = ["t", "x", "y", "z", "vx", "vy", "vz", *(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "qw", "qx", "qy",
+    wanted = ["time", "x", "y", "z", "vx", "vy", "vz", *(f"q{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "qw", "qx", "qy",
               "qz", "phi", "theta", "psi", "kinetic", "potential", "energy", "work"]  # fmt: skip
     wanted += [f"{name}_body_{k}" for name in ("omega", "L") for k in (1, 2, 3)]
     wanted += [f"{name}_lab_{k}" for name in ("omega", "L") for k in "xyz"]
-    assert set(wanted) <= set(columns)
-    assert {"energy_error", "L_z_error", "L_3_error", "orthogonality_error"} <= set(columns)
+    assert set(wanted) <= {header.split()[0] for header in columns}
+    assert {"energy_error", "L_z_error", "L_3_error", "orthogonality_error", "qw", "q23"} <= set(columns)
+    assert {
+        "time (s)",
+        "x (m)",
+        "vz (m/s)",
+        "phi (rad)",
+        "omega_lab_x (rad/s)",
+        "L_body_3 (kg m^2/s)",
+        "work (J)",
+    } <= set(columns)
     # the same from Python, to the last bit
     scene = rigidmd.Scene.read(TOP, {"run.duration_s": 0.05})
     results = rigidmd.Simulation(scene).run()
     with np.load(folder / "motion.npz") as stored:
-        for name, column in columns.items():
-            found = results["time" if name == "t" else name]
+        assert set(stored) == {header.split()[0] for header in columns}
+        for header, column in columns.items():
+            name = header.split()[0]
+            found = results[name]
             assert column.tobytes() == found.tobytes() == stored[name].tobytes(), name
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["steps"] == 100
@@ -62,6 +75,23 @@ def test_a_run_leaves_what_it_promises(tmp_path, capsys):
     # the resolved scene is the same run
     again = Simulation(Scene.read(folder / "scene.toml")).run()
     assert again["theta"].tobytes() == results["theta"].tobytes()
+
+
+def test_a_motion_without_units_in_its_header_is_read_as_well(tmp_path, capsys):
+    """As earlier versions wrote it."""
+    run = ["run", str(TOP), *SHORT, "--set", "output.figures=false", "-o"]
+    assert main([*run, str(tmp_path / "new")]) == main([*run, str(tmp_path / "old")]) == 0
+    path = tmp_path / "old" / "motion.csv"
+    head, rest = path.read_text().split("\n", 1)
+    names = [header.split()[0] for header in head.split(",")]
+    path.write_text(",".join(["t", *names[1:]]) + "\n" + rest)
+    new, old = (read_record(tmp_path / name) for name in ("new", "old"))
+    assert list(old.columns) == list(new.columns)
+    assert all(old.columns[name].tobytes() == new.columns[name].tobytes() for name in new.columns)
+    capsys.readouterr()
+    assert main(["compare", str(tmp_path / "new"), str(tmp_path / "old")]) == 0
+    assert "the runs are the same to the last bit" in capsys.readouterr().out
+    assert main(["view", str(tmp_path / "old")]) == 0
 
 
 def test_columns_agree_with_each_other():
@@ -137,7 +167,7 @@ def test_an_observer_sees_the_body_and_an_interrupted_run_keeps_what_it_has(tmp_
     results = simulation.run()
     assert results.interrupted
     assert results["time"][-1] == pytest.approx(0.025)
-    assert read(tmp_path / "run" / "motion.csv")["t"][-1] == results["time"][-1]
+    assert read(tmp_path / "run" / "motion.csv")["time (s)"][-1] == results["time"][-1]
     assert poses[-1].rotation[2, 2] == pytest.approx(np.cos(results["theta"][-1]), abs=1e-14)
 
 
@@ -146,7 +176,7 @@ def test_a_run_that_fails_keeps_the_motion_so_far(tmp_path):
                              "start.euler_angles_deg": [0.0, 1e-3, 0.0], "start.euler_rates_rad_s": [0.0, -5.0, 0.0]})  # fmt: skip
     with pytest.raises(SimulationError, match=r"singular at t = .* too near 0"):
         Simulation(scene, tmp_path / "run").run()
-    assert len(read(tmp_path / "run" / "motion.csv")["t"]) >= 1
+    assert len(read(tmp_path / "run" / "motion.csv")["time (s)"]) >= 1
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)

@@ -286,9 +286,9 @@ def test_what_a_document_says_can_be_done(document, tmp_path, monkeypatch, capsy
 
 
 def _first_of_its_kind(column: str) -> str:
-    """The column that stands in the manual for all of its kind: omega_body_1 for omega_body_2, q11 for q23."""
+    """The column that stands in the manual for all of its kind: omega_body_1 (rad/s) for omega_body_2 (rad/s), q11 for q23."""
     column = re.sub(r"^L_\w+_error$", "L_z_error", column)
-    return re.sub(r"_[xyz]$", "_x", re.sub(r"_[123]$", "_1", re.sub(r"^q\d\d$", "q11", column)))
+    return re.sub(r"_[xyz](?= \(|$)", "_x", re.sub(r"_[123](?= \(|$)", "_1", re.sub(r"^q\d\d$", "q11", column)))
 
 
 def section(title: str) -> str:

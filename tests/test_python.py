@@ -137,7 +137,7 @@ def test_a_data_frame_has_the_headers_of_the_log(tmp_path):
     results = Simulation(Scene.read(TOP, SHORT), tmp_path / "b").run()
     frame = results.to_dataframe()
     assert list(frame.columns) == (tmp_path / "b" / "motion.csv").read_text().splitlines()[0].split(",")
-    assert (frame["theta"] == results["theta"]).all()
+    assert (frame["theta (rad)"] == results["theta"]).all()
 
 
 def test_without_pandas_one_sentence_says_so(monkeypatch):

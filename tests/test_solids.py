@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.special import elliprd
 from scipy.spatial.transform import Rotation
+from scipy.special import elliprd
 from support import COMPONENTS_PER_DIMENSION as NUMBERS
 from support import ROOT, SOLIDS, added_mass_of_ellipsoid, build_body, inertia_tensor, solid
 
@@ -140,7 +140,11 @@ PARTS = [
 ]
 PARTS = [part | DIMENSIONS[part["shape"]] for part in PARTS]
 RUN = {"duration_s": 1.0, "timestep_s": 0.01}
-VOLUMES = {"cone": np.pi * 0.7**2 * 1.9 / 3, "ellipsoid": 4 / 3 * np.pi * 0.4 * 1.1 * 2.3, "sphere": 4 / 3 * np.pi * 1.3**3}
+VOLUMES = {
+    "cone": np.pi * 0.7**2 * 1.9 / 3,
+    "ellipsoid": 4 / 3 * np.pi * 0.4 * 1.1 * 2.3,
+    "sphere": 4 / 3 * np.pi * 1.3**3,
+}
 
 
 def points_of(part):

@@ -17,8 +17,8 @@ from PIL import Image, ImageSequence
 from support import ROOT, SOLIDS, UNITS, build_body, connections, mesh_of, molecule_film, read_record, solid, write_film
 
 from rigidmd import Scene, Simulation
-from rigidmd.mechanics.inertia import shifted_inertia
 from rigidmd.commands import cli
+from rigidmd.mechanics.inertia import shifted_inertia
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
@@ -580,7 +580,10 @@ def test_a_body_has_its_edges_as_bonds(tmp_path):
         ({"mass_kg": 1.0, "solid": {"shape": "ring", "radius_m": 1.0}}, 24),
         ({"mass_kg": 1.0, "solid": {"shape": "rod", "length_m": 1.0}}, 12),
         ({"solids": [CYLINDER, CYLINDER | {"position_m": [0.0, 5.0, 0.0]}]}, 36 + 1 + 36),
-        ({"solids": [CYLINDER, TILTED[0], TILTED[0] | {"position_m": [9.0, 0.0, 0.0]}], "pinned": True}, 1 + 36 + 2 + 24),
+        (
+            {"solids": [CYLINDER, TILTED[0], TILTED[0] | {"position_m": [9.0, 0.0, 0.0]}], "pinned": True},
+            1 + 36 + 2 + 24,
+        ),
         ({"points": [{"mass_kg": 1.0, "position_m": [x, x * x, 0.0]} for x in (0.0, 1.0, 2.0, 3.0)]}, 3),
     ],
 )

@@ -99,9 +99,13 @@ def chosen_by_type(choose: Callable | None = None, **options: bool) -> Any:
     return stub
 
 
-def compile_user_function(function: Callable, inline: bool = False) -> Callable:
-    """A user's function for compiled code, with the options of a kernel; it is not cached on disk by itself."""
-    return numba.njit(**compiler_options(inline))(getattr(function, "py_func", function))
+def compile_user_function(function: Callable, inline: bool = False, checks_indices: bool = False) -> Callable:
+    """A user's function for compiled code, with the options of a kernel; it is not cached on disk by itself.
+
+    checks_indices : whether an index beyond an array raises IndexError
+    """
+    options = compiler_options(inline) | ({"boundscheck": True} if checks_indices else {})
+    return numba.njit(**options)(getattr(function, "py_func", function))
 
 
 def compiler_options(inline: bool = False, count_references: bool = True) -> dict:

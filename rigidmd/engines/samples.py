@@ -125,7 +125,16 @@ BODY = {
 }
 #: Additional key of `results[...]` for a body: several columns as one array.
 MATRIX = "Q"
-BODY_COLUMNS = {n: Column("t" if n == "time" else n, f.unit, f.about) for f in BODY.values() for n in f.names}
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """The header of a column of motion.csv, such as "phi (rad)"; in ASCII, as the headers of log.csv."""
+    return name if unit == "1" else f"{name} ({unit.replace('²', '^2')})"
+
+
+BODY_COLUMNS = {n: Column(_with_unit(n, f.unit), f.unit, f.about) for f in BODY.values() for n in f.names}
+#: Header of a column of motion.csv -> its name, also without units, as earlier versions wrote them.
+BODY_HEADERS = {name: name for name in BODY_COLUMNS} | {"t": "time"} | {c.header: n for n, c in BODY_COLUMNS.items()}
 
 
 class SampleTable(ABC):

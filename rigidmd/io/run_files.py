@@ -146,6 +146,12 @@ def read_columns(path: Path) -> Columns | None:
     return Columns(path, {header: [line[k] for line in lines] for k, header in enumerate(head)})
 
 
+def read_motion(path: Path) -> Columns | None:
+    """motion.csv as `read_columns`, its columns by their names in Python, as far as they are known; of any version."""
+    found = read_columns(path)
+    return found and Columns(path, {samples.BODY_HEADERS.get(header, header): c for header, c in found.cells.items()})
+
+
 def _lines(file: Any) -> Iterator[str]:
     """The complete lines of a file. Raises csv.Error for a line that is too long."""
     while line := file.readline(LONGEST_LINE):

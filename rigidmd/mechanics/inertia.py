@@ -189,8 +189,8 @@ def solid(shape: str, mass: float, dimensions: Mapping[str, float | Sequence[flo
 
 
 class Part(NamedTuple):
-    """A solid of a body: its mass, its own `Solid`, the position (3,) of its centre of mass and its rotation (3, 3), from
-    its principal axes to the axes of the body."""
+    """A solid of a body: its mass, its own `Solid`, the position (3,) of its centre of mass and its
+    rotation (3, 3), from its principal axes to the axes of the body."""
 
     mass: float
     solid: Solid
@@ -199,8 +199,8 @@ class Part(NamedTuple):
 
 
 class Assembly(NamedTuple):
-    """A body of several solids, along the body's axes: mass, centre of mass (3,), inertia tensor (3, 3) about it, and the
-    outline (k, 3) of each solid from it."""
+    """A body of several solids, along the body's axes: mass, centre of mass (3,), inertia tensor
+    (3, 3) about it, and the outline (k, 3) of each solid from it."""
 
     mass: float
     centre: np.ndarray
@@ -209,8 +209,8 @@ class Assembly(NamedTuple):
 
 
 def assemble_solids(parts: Sequence[Part]) -> Assembly:
-    """The rigid body of solids, whose masses and inertia add up, by the parallel axis theorem. Where solids overlap, both
-    masses are there."""
+    """The rigid body of solids, whose masses and inertia add up, by the parallel axis theorem.
+    Where solids overlap, both masses are there."""
     masses, positions = np.array([part.mass for part in parts]), np.array([part.position for part in parts])
     mass = float(masses.sum())
     centre = masses @ positions / mass

@@ -17,6 +17,7 @@ from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.engines.protocol import Engine, NotFiniteError
+from rigidmd.engines.samples import MATRIX
 from rigidmd.errors import SimulationError
 from rigidmd.figures.body import FIGURES
 from rigidmd.forces.body.applied import SteadyForce
@@ -183,9 +184,12 @@ class MotionFiles(Observer):
         self._sampler, self._npz = sampler, npz
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        for name, write in ((MOTION, write_columns), (MOTION_NPZ, write_npz))[: 2 if self._npz else 1]:
-            write(run.path(name), results.samples.written)
-            results.files.append(run.path(name))
+        samples = results.samples
+        write_columns(run.path(MOTION), samples.written)
+        results.files.append(run.path(MOTION))
+        if self._npz:
+            write_npz(run.path(MOTION_NPZ), {name: samples[name] for name in samples.described if name != MATRIX})
+            results.files.append(run.path(MOTION_NPZ))
 
     def failed(self, run: "Simulation") -> str:
         if not self._sampler.snapshots:

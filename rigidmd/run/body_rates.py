@@ -1,7 +1,7 @@
-"""Rates and periods of the motion of a single body: precession, nutation, spin, flips, each measured from the samples of a
-run, and by theory where there is a closed form."""
+"""Rates and periods of the motion of a single body: precession, nutation, spin, flips, each
+measured from the samples of a run, and by theory where there is a closed form."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from rigidmd.mechanics.translation import FluidTranslation, InertialFrame
 from rigidmd.run.body_theory import free_body_period, heavy_top_motion
 from rigidmd.scene.body import EQUAL_MOMENTS
 
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-
 #: Least samples of a motion, and of each period in it.
 LEAST_SAMPLES, SAMPLES_PER_PERIOD = 16, 8
 #: Angle (rad) within which an axis that stays there is along another, and an angle that stays there is constant.
@@ -28,7 +25,8 @@ FLIP_COSINE = np.cos(np.radians(30))
 
 
 class Rate(NamedTuple):
-    """A rate or period, in the unit of its key; None if the samples do not show it, or if there is no closed form."""
+    """A rate or period, in the unit of its key; None if the samples do not show it, or if there is
+    no closed form."""
 
     measured: float | None
     theory: float | None
@@ -77,8 +75,8 @@ def _has_theory(system: BodySystem) -> bool:
 
 
 def _of_heavy_body(system: BodySystem, motion: Motion, down: np.ndarray, moment: np.ndarray) -> dict[str, Rate]:
-    """Rates of a body on which a constant force acts. down (3,) : its direction. moment (3,) : force times point of action,
-    principal axes, N m"""
+    """Rates of a body on which a constant force acts. down (3,) : its direction. moment (3,) :
+    force times point of action, principal axes, N m"""
     axis, size = moment / np.linalg.norm(moment), float(np.linalg.norm(moment))
     path = _path_of_axis(motion, system.axes @ axis)
     polar, azimuth = _angles(path, -down)
@@ -100,10 +98,11 @@ def _of_heavy_body(system: BodySystem, motion: Motion, down: np.ndarray, moment:
         return rates
     rates["precession_rad_s"] = Rate(_slope(motion["time"], azimuth), precession)
     if np.ptp(polar) > SMALL_ANGLE:
-        when = _crossings(motion["time"], np.cos(polar))[0]
-        rates["nutation_period_s"] = Rate(_mean_interval(when), nutation)
+        cosine = np.cos(polar)
+        period, rate = _periods(motion["time"], cosine, 0.5 * (cosine.max() + cosine.min()), azimuth)
+        rates["nutation_period_s"] = Rate(period, nutation)
         if precession is not None:
-            rates["precession_rad_s"] = Rate(_rate_over(motion["time"], azimuth, when), precession)
+            rates["precession_rad_s"] = Rate(rate, precession)
     return rates
 
 
@@ -126,12 +125,10 @@ def _of_free_body(system: BodySystem, motion: Motion) -> dict[str, Rate]:
     if system.kind != "asymmetric" or np.ptp(omega, axis=0).max() <= SMALL_ANGLE * np.abs(omega).max():
         return {}
     middle = int(np.argsort(inertia)[1])
-    rising, falling = _crossings(motion["time"], omega[:, middle], 0.0)
-    period = free_body_period(inertia, omega[0])
-    rates = {"omega_period_s": Rate(_mean_interval(rising), period)}
-    if (np.abs(omega[:, middle]) * inertia[middle]).max() > FLIP_COSINE * size:
-        flips = _mean_interval(np.sort(np.concatenate([rising, falling])))
-        rates["flip_interval_s"] = Rate(flips, period / 2)
+    time, swings, period = motion["time"], omega[:, middle], free_body_period(inertia, omega[0])
+    rates = {"omega_period_s": Rate(_periods(time, swings, 0.0, swings)[0], period)}
+    if np.abs(swings).max() * inertia[middle] > FLIP_COSINE * size:
+        rates["flip_interval_s"] = Rate(_periods(time, swings, 0.0, swings, both_ways=True)[0], period / 2)
     return rates
 
 
@@ -146,8 +143,8 @@ def _path_of_axis(motion: Motion, axis_body: np.ndarray) -> np.ndarray:
 
 
 def _angles(path: np.ndarray, pole: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Polar angle (t,) of directions (t, 3) from a pole, and their azimuth about it, continuous; None where samples do not
-    show how far it went: near the pole, or with too few of them."""
+    """Polar angle (t,) of directions (t, 3) from a pole, and their azimuth about it, continuous;
+    None where samples do not show how far it went: near the pole, or with too few of them."""
     first = np.cross(pole, np.eye(3)[np.abs(pole).argmin()])
     first /= np.linalg.norm(first)
     x, y, z = path @ first, path @ np.cross(pole, first), path @ pole
@@ -157,44 +154,43 @@ def _angles(path: np.ndarray, pole: np.ndarray) -> tuple[np.ndarray, np.ndarray 
     return polar, None if stays or np.abs(np.diff(azimuth)).max() > LARGEST_CHANGE else azimuth
 
 
-def _crossings(time: np.ndarray, values: np.ndarray, level: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Times at which samples pass a level upwards and downwards, by cubic splines; default: the middle of their range.
-    Empty if a period has too few samples."""
-    level = 0.5 * (values.max() + values.min()) if level is None else level
-    scale = np.abs(values - level).max()
-    if not (scale > 0 and np.isfinite(scale)):
-        return np.zeros(0), np.zeros(0)
-    spline, begin, span = _spline(time, (values - level) / scale)
-    when = np.atleast_1d(spline.roots(extrapolate=False))
-    when = when[np.isfinite(when)]
-    if 2 * len(time) < SAMPLES_PER_PERIOD * len(when):
-        return np.zeros(0), np.zeros(0)
-    rises = spline(when, 1) > 0
-    return begin + span * when[rises], begin + span * when[~rises]
+def _periods(
+    time: np.ndarray, values: np.ndarray, level: float, other: np.ndarray, both_ways: bool = False
+) -> tuple[float | None, float | None]:
+    """The mean time between passages of samples (t,) through a level, and the mean rate of another
+    series (t,) from the first to the last of them; None if there are less than two, or a period has
+    too few samples.
+
+    both_ways : passages upwards and downwards, not upwards alone
+    """
+    time, rows = np.unique(time, return_index=True)
+    above = (values := values[rows] - level) > 0
+    passes = np.flatnonzero(above[1:] != above[:-1])
+    if 2 * len(time) < SAMPLES_PER_PERIOD * len(passes):
+        return None, None
+    counted = passes if both_ways else passes[above[passes + 1]]
+    if len(counted) < 2:
+        return None, None
+    (begin, before), (end, after) = (_interpolated(int(k), time, values, other[rows]) for k in counted[[0, -1]])
+    return (end - begin) / (len(counted) - 1), (after - before) / (end - begin)
 
 
-def _spline(time: np.ndarray, values: np.ndarray) -> "tuple[CubicSpline, float, float]":
-    """A cubic spline through samples, its begin and its span: its argument is the time since the begin, in spans."""
-    from scipy.interpolate import CubicSpline  # slow to import
-
-    begin, span = float(time[0]), float(time[-1] - time[0])
-    fraction, rows = np.unique((time - begin) / span, return_index=True)
-    return CubicSpline(fraction, values[rows]), begin, span
-
-
-def _mean_interval(when: np.ndarray) -> float | None:
-    """The mean time between events; None with less than two."""
-    return float((when[-1] - when[0]) / (len(when) - 1)) if len(when) > 1 else None
+def _interpolated(k: int, time: np.ndarray, values: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Time between samples k and k + 1 at which values are 0, and the value of the other series
+    there, by cubic polynomials through the four samples around."""
+    near = slice(first := min(max(k - 1, 0), len(time) - 4), first + 4)
+    span = time[k + 1] - time[k]
+    fractions = (time[near] - time[k]) / span
+    size = np.abs(values[near]).max()
+    roots = np.roots(np.polyfit(fractions, values[near] / size, 3))
+    straight = values[k] / (values[k] - values[k + 1])
+    fraction = float(roots[np.abs(roots - straight).argmin()].real)
+    begin = other[k]  # angles of many rotations keep their digits
+    return float(time[k] + span * fraction), float(
+        begin + np.polyval(np.polyfit(fractions, other[near] - begin, 3), fraction)
+    )
 
 
 def _slope(time: np.ndarray, values: np.ndarray) -> float:
     """The mean rate of change."""
     return float((values[-1] - values[0]) / (time[-1] - time[0]))
-
-
-def _rate_over(time: np.ndarray, values: np.ndarray, when: np.ndarray) -> float | None:
-    """The mean rate of change between the first and the last of some times; None with less than two."""
-    if len(when) < 2:
-        return None
-    spline, begin, span = _spline(time, values)
-    return _slope(when[[0, -1]], spline((when[[0, -1]] - begin) / span))

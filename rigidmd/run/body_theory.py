@@ -1,4 +1,5 @@
-"""Rates and periods of a single body in closed form: Lagrange's top, and bodies that no torque acts on.
+"""Rates and periods of a single body in closed form: Lagrange's top, and bodies that no torque acts
+on.
 
 Any consistent units. See "Tops in gravity" in the theory chapter `bodies`.
 """
@@ -9,8 +10,9 @@ import numpy as np
 
 
 class TopMotion(NamedTuple):
-    """The motion of the axis of a heavy symmetric top: mean rate of precession about the vertical, over whole periods of
-    nutation, and this period; for steady precession the period of a small nutation."""
+    """The motion of the axis of a heavy symmetric top: mean rate of precession about the vertical,
+    over whole periods of nutation, and this period; for steady precession the period of a small
+    nutation."""
 
     precession: float
     nutation_period: float
@@ -19,18 +21,20 @@ class TopMotion(NamedTuple):
 def heavy_top_motion(
     across: float, moment: float, momentum: float, cosine: float, transverse: float, turning: float
 ) -> TopMotion:
-    """The motion of a heavy symmetric top from its state at one time; NaN where numbers are too large or small for it.
+    """The motion of a heavy symmetric top from its state at one time; NaN where numbers are too
+    large or small for it.
 
     across : moment of inertia across the axis, about the pivot
     moment : weight times the distance of the centre of mass from the pivot, m g l > 0
     momentum : angular momentum along the axis, L3
     cosine : of the angle between the axis and the vertical, u0
     transverse : square of the angular momentum across the axis
-    turning : component of the angular momentum across the axis along the vertical, I1 phi' sin² theta
+    turning : component of the angular momentum across the axis along the vertical, I1 phi' sin²
+        theta
 
-    u = cos theta oscillates between the lower two roots of a cubic (Whittaker, section 71), here in x = u - u0, in which
-    fast tops have no cancellation. The angle of precession is a sum of elliptic integrals of the third kind, of 1/(1 - u)
-    and 1/(1 + u), by Carlson's forms.
+    u = cos theta oscillates between the lower two roots of a cubic (Whittaker, section 71), here in
+    x = u - u0, in which fast tops have no cancellation. The angle of precession is a sum of
+    elliptic integrals of the third kind, of 1/(1 - u) and 1/(1 + u), by Carlson's forms.
     """
     from scipy.special import ellipk, elliprf, elliprj  # slow to import
 
@@ -61,8 +65,9 @@ def heavy_top_motion(
 def free_body_period(inertia: np.ndarray, omega: np.ndarray) -> float:
     """The period of omega in a body with three different moments that no torque acts on: 4 K(m)/p.
 
-    inertia, omega (3,) : along the principal axes. Twice in a period the component along the axis of the middle moment is
-    zero. Infinite for a motion that never returns, such as rotation about the middle axis.
+    inertia, omega (3,) : along the principal axes. Twice in a period the component along the axis
+        of the middle moment is zero. Infinite for a motion that never returns, such as rotation
+        about the middle axis.
     """
     from scipy.special import ellipkm1
 

@@ -20,7 +20,7 @@ from rigidmd.engines.samples import Sample
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.molecules import Watch
+from rigidmd.scene.molecules import Watch, name_of
 from rigidmd.units import BOLTZMANN, FEMTOSECOND, KJ_PER_MOL
 
 #: Opposite charges without repulsion count as collapsed below this fraction of the smallest diameter; the hydrogen of a
@@ -248,7 +248,15 @@ def explain(
         a, b = site_labels(system, pair)
         whose = "the smallest" if pair.without_repulsion else "their"
         text += f"; {where}{a} and {b} are {pair.distance:.3g} Å apart, {pair.fraction:.2g} of {whose} diameter"
-    return f"{text}. Likely cause: {_cause(system, failed, pair, dt, stable)}"
+    return f"{text}. Likely cause: {_user_code(system)}{_cause(system, failed, pair, dt, stable)}"
+
+
+def _user_code(system: System) -> str:
+    """What a user has added to the steps themselves, as a possible cause; empty without it."""
+    rows = {row.name for row in system.scene.integrators} & {stage.integrator for stage in system.scene.stages}
+    named = [] if system.thermostat is None else [f"the thermostat {name_of(system.thermostat)}, from Python"]
+    named += [f"the integrator {name}, from the scene" for name in sorted(rows)]
+    return f"{' or '.join(named)} (the run without it shows whether), or " if named else ""
 
 
 def _cause(system: System, failed: FailedCheck, pair: OverlappingPair | None, dt: float, stable: float | None) -> str:

@@ -18,13 +18,12 @@ from rigidmd.engines.samples import BODY, BODY_COLUMNS
 from rigidmd.errors import CheckpointError, OutputError
 from rigidmd.io.checkpoint import latest
 from rigidmd.io.folder import LOG, MOTION, SCENE, SUMMARY, check_is_run
-from rigidmd.io.run_files import Summary, read_columns, read_json
+from rigidmd.io.run_files import Summary, read_columns, read_json, read_motion
 from rigidmd.scene import BodyScene, MolecularScene, Scene
 from rigidmd.scene.stage import Stage
 
-#: Name of a column -> its header in log.csv, and back.
+#: Header of a column of log.csv -> its name.
 HEADERS = {column.header: name for name, column in samples.IN_LOGS.items() if column.header}
-BODY_HEADERS = {column.header: name for name, column in BODY_COLUMNS.items()}
 
 
 @dataclass(frozen=True)
@@ -133,15 +132,14 @@ def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> n
 
 def _motion(folder: Path, system: BodySystem, missing: list[str]) -> dict[str, np.ndarray]:
     """Columns of motion.csv, or, of a run that has not written it, of its last checkpoint."""
-    if (found := read_columns(folder / MOTION)) is not None:
+    if (found := read_motion(folder / MOTION)) is not None:
         families = ["time", "position", "kinetic", "potential", "energy", "work"]  # that every motion has
         if system.rotates:
             families += ["rotation", "quaternion", "euler_angles", "omega_body", "omega_lab", "L_lab"]
         needed = [name for family in families for name in BODY[family].names]
-        if lacking := [header for name in needed if (header := BODY_COLUMNS[name].header) not in found.cells]:
+        if lacking := [BODY_COLUMNS[name].header for name in needed if name not in found.cells]:
             raise OutputError(f"{found.path} is not the motion of this run: it has no column {lacking[0]!r}")
-        names = {header: BODY_HEADERS.get(header, header) for header in found.cells}
-        return {name: found.numbers(header, finite=name in needed) for header, name in names.items()}
+        return {name: found.numbers(name, finite=name in needed) for name in found.cells}
     try:
         kept, _ = latest(folder)
     except CheckpointError:

@@ -86,7 +86,11 @@ def body_rows(summary: dict) -> list[tuple[str, str]]:
     if summary["theta_range_deg"]:
         low, high = summary["theta_range_deg"]
         rows.append(("theta", f"between {low:.6f}° and {high:.6f}°"))
-    rows += [(RATES[name][0], _rate(rate, RATES[name][1])) for name, rate in summary.get("rates", {}).items() if name in RATES]
+    rows += [
+        (RATES[name][0], _rate(rate, RATES[name][1]))
+        for name, rate in summary.get("rates", {}).items()
+        if name in RATES
+    ]
     for name, error in summary["largest_relative_error"].items():
         of = "the largest kinetic energy" if name == "energy" else "the largest |L|"
         rows.append((f"{name} error", f"at most {error:.1e} of {of}"))

@@ -79,7 +79,8 @@ class Solid(Section):
 
 
 class SolidPart(Solid):
-    """A homogeneous solid of a body made of several. Where two overlap, the masses of both are there."""
+    """A homogeneous solid of a body made of several. Where two overlap, the masses of both are
+    there."""
 
     mass_kg: Positive | None = None
     """Mass of this solid"""

@@ -14,12 +14,12 @@ from rigidmd.core.state_file import read_state
 from rigidmd.core.toml import read_toml
 from rigidmd.errors import OutputError, RigidMDError, SceneError
 from rigidmd.io.folder import FINAL, LOG, MOTION, SCENE, SUMMARY, check_is_run
-from rigidmd.io.run_files import Columns, Summary, read_columns, read_json
+from rigidmd.io.run_files import Columns, Summary, read_columns, read_json, read_motion
 from rigidmd.io.write import columns_text
 from rigidmd.run.resume import MADE_WITH, differences, keys_of
 
 #: Columns by which samples are matched: steps if they have the same times in both files, else times.
-STEP, TIMES = "Step", ("Time (ps)", "t")
+STEP, TIMES = "Step", ("Time (ps)", "time")
 BITS = 53  # bits of the significand of a float64
 
 
@@ -100,8 +100,8 @@ def compare(first: Path, second: Path) -> RunComparison:
             of_run |= {f"processor has {feature}": True for feature in there.get("processor_features", ())}
             made.append(of_run | {f"file of {key}": sha[:12] for key, sha in there.get("input_sha256", {}).items()})
         found.made = differences(made[0], made[1], "not recorded")
-    for name in (LOG, MOTION):
-        if either(name) and (tables := both(name, read_columns)):
+    for name, read in ((LOG, read_columns), (MOTION, read_motion)):
+        if either(name) and (tables := both(name, read)):
             found.samples = _compare_samples(name, *tables)
     if either(FINAL) and (saved := both(FINAL, read_state)):
         for name, a, b in zip(State._fields, *(of.state for of in saved), strict=True):

@@ -1,4 +1,5 @@
-"""The surface of a single body for drawings: its solids, its points joined by rods, or a solid of the same inertia."""
+"""The surface of a single body for drawings: its solids, its points joined by rods, or a solid of
+the same inertia."""
 
 from itertools import product
 from typing import NamedTuple
@@ -37,7 +38,8 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(system: BodySystem) -> Mesh:
-    """The surface of a body: as the scene requests, its solids, its points joined, or a body of equal inertia."""
+    """The surface of a body: as the scene requests, its solids, its points joined, or a body of
+    equal inertia."""
     table, scene = system.scene.body, system.scene
     mass, _, centre, _, _ = inertia_of(scene)
     wanted = scene.output.drawn_as
@@ -145,8 +147,8 @@ def _joined(parts: list[Mesh], about: str) -> Mesh:
 
 
 def _cut(mesh: Mesh) -> Mesh:
-    """The same surface with long faces of four corners in pieces. Faces are drawn from the furthest to the nearest, which
-    is right where solids meet only if they are short."""
+    """The same surface with long faces of four corners in pieces. Faces are drawn from the furthest
+    to the nearest, which is right where solids meet only if they are short."""
     longest = LONGEST_FACE * mesh.reach
     vertices, faces, painted = [*mesh.vertices], [], []
     for face, color in zip(mesh.faces, mesh.painted, strict=True):

@@ -67,10 +67,10 @@ def _body_panels(record: Record) -> list[Panel]:
     found = []
     if "theta" in seen:
         found.append(Panel("θ (°)", [("", np.degrees(seen["theta"]))]))
-        angles = [(name, np.unwrap(seen[key])) for name, key in (("φ", "phi"), ("ψ", "psi"))]
-        in_turns = max(np.ptp(values) for _, values in angles) > 2 * np.pi
-        unit, size = ("turns", 2 * np.pi) if in_turns else ("°", np.pi / 180)
-        found.append(Panel(f"φ and ψ ({unit})", [(name, values / size) for name, values in angles]))
+        for name, key in (("φ", "phi"), ("ψ", "psi")):  # one panel each: precession is much slower than spin
+            angle = np.unwrap(seen[key])
+            unit, size = ("turns", 2 * np.pi) if np.ptp(angle) > 2 * np.pi else ("°", np.pi / 180)
+            found.append(Panel(f"{name} ({unit})", [("", angle / size)]))
         omega = [("ω" + "₁₂₃"[k], seen[f"omega_body_{k + 1}"]) for k in range(3)]
         found.append(Panel("ω along the body's axes (rad/s)", omega))
     if "x" in seen and any(np.ptp(seen[k]) > 0 for k in "xyz") and record.system.translates:

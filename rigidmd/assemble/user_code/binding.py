@@ -1,16 +1,15 @@
 """Binds user code to a system: forces and a thermostat become terms, and errors in their code become messages."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
+from rigidmd.assemble.user_code.compiled import describe_compile_error
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
 from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
@@ -75,17 +74,8 @@ def user_errors_explained(system: System) -> Iterator[None]:
     except CompileError as error:
         if not system.user_terms and system.thermostat is None:
             raise
-        unknown = re.findall(r">>> (\S.*)", str(error))
-        plain = re.findall(r"Untyped global name '(\w+)'", str(error))
-        files = re.findall(r'File "(?!<)([^"]+)", line (\d+)', str(error))
-        ours = [(file, line) for file, line in files if "/rigidmd/" not in file and "/numba/" not in file]
-        where = f" (near line {ours[-1][1]} of {Path(ours[-1][0]).name})" if ours else ""
-        if plain:
-            why = f"it uses {plain[-1]}, which is not compiled: if it is a function, put numba.njit before it"
-        else:
-            why = f"Numba knows no {unknown[-1]}" if unknown else str(error).strip().splitlines()[-1]
         names = ", ".join([*system.user_terms, *(["the thermostat"] if system.thermostat is not None else [])])
-        raise SceneError(system.scene.source, [f"{names}: cannot be compiled{where}: {why}"]) from None
+        raise SceneError(system.scene.source, [f"{names}: cannot be compiled{describe_compile_error(error)}"]) from None
 
 
 def with_user_code(system: System) -> System:

@@ -16,9 +16,10 @@ FLAT, THIN = 1e-6, 1e-9
 
 
 def connections(system: Any, massless: bool = False) -> np.ndarray:
-    """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull of each solid or the
-    shortest links between points, with links between solids and from a pinned body to its pivot. `massless`: whether
-    massless sites are joined to their nearest atoms, so that each molecule is connected."""
+    """Pairs (b, 2) of sites that are joined: bonds of molecules, or of a body the edges of the hull
+    of each solid or the shortest links between points, with links between solids and from a pinned
+    body to its pivot. `massless`: whether massless sites are joined to their nearest atoms, so that
+    each molecule is connected."""
     if hasattr(system, "species"):
         starts = np.searchsorted(system.sites.molecule, np.arange(len(system.model.species)))
         chosen = [[pair for pair in bonds(m) if massless or m.masses[pair[1]] > 0] for m in system.species]
@@ -53,7 +54,8 @@ def shortest_links(points: np.ndarray) -> np.ndarray:
 
 
 def _edges_of_solids(points: np.ndarray, counts: list[int]) -> np.ndarray:
-    """Edges (b, 2) of the hulls of solids, whose points follow one another, and the shortest links that join the solids.
+    """Edges (b, 2) of the hulls of solids, whose points follow one another, and the shortest links
+    that join the solids.
 
     counts : number of points of each solid
     """
