@@ -359,11 +359,13 @@ HOMES = {
     "assemble.time_step": "MARGIN MIXED_ERROR error_of_step stable_angle step_error step_warnings",
     "forces.ewald.errors": "charges_in pme_error real_error",
     "run.summary": "ewald_error_notes summarise",
+    "run.body_theory": "free_body_period heavy_top_motion",
     "run.pilot.trials": "Method IntegratorAccuracy TrialSystem Trial measure time_span",
     "mechanics.translation": "NoTranslation",
     "mechanics.batches": "LANES kick_group apply_langevin_group rotate_group",
     "mechanics.inertia": (
-        "COMPONENTS_PER_DIMENSION SOLIDS added_mass_of_ellipsoid inertia_tensor kind_of_body principal_frame solid "
+        "COMPONENTS_PER_DIMENSION SOLIDS added_mass_of_ellipsoid inertia_tensor kind_of_body principal_frame "
+        "shifted_inertia solid"
     ),
     "mechanics.rotation": (
         "align angular_velocity_of_euler_rates attitude_matrix euler_rates from_attitude_matrix "

@@ -9,13 +9,12 @@ import MDAnalysis as mda
 import numpy as np
 import pytest
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from support import BODIES, ROOT, CheckpointSchedule, Picture, build_body, write_scene
+from support import BODIES, ROOT, CheckpointSchedule, Picture, build_body, read_record, write_scene
 
 import rigidmd
 from rigidmd.commands.cli import main
 from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Every, Simulation
-from rigidmd.run.record import read_record
 from rigidmd.scene import Scene
 
 TOP = ROOT / "systems" / "heavy_top_3.toml"

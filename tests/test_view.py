@@ -14,11 +14,22 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
-from support import ROOT, SOLIDS, UNITS, build_body, connections, mesh_of, molecule_film, read_record, solid, write_film
+from support import (
+    ROOT,
+    SOLIDS,
+    UNITS,
+    build_body,
+    connections,
+    mesh_of,
+    molecule_film,
+    read_record,
+    shifted_inertia,
+    solid,
+    write_film,
+)
 
 from rigidmd import Scene, Simulation
 from rigidmd.commands import cli
-from rigidmd.mechanics.inertia import shifted_inertia
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""

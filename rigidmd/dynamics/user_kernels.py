@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 from rigidmd.compile import implements
@@ -12,6 +13,13 @@ from rigidmd.forces.terms import add_forces
 #: The registered classes, and the function of each.
 FORCES: dict[type, Callable[..., Any]] = {}
 THERMOSTATS: dict[type, Callable[..., Any]] = {}
+
+
+@cache
+def with_checked_indices(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A registered function by itself, compiled such that an index beyond an array raises IndexError."""
+    return compile_user_function(function, checks_indices=True)
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

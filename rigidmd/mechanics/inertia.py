@@ -216,8 +216,8 @@ def assemble_solids(parts: Sequence[Part]) -> Assembly:
     centre = masses @ positions / mass
     tensor, outlines = np.zeros((3, 3)), []
     for part in parts:
-        own = part.rotation @ np.diag(part.solid.inertia) @ part.rotation.T
-        tensor += shifted_inertia(own, part.mass, part.position - centre)
+        tensor_of_part = part.rotation @ np.diag(part.solid.inertia) @ part.rotation.T
+        tensor += shifted_inertia(tensor_of_part, part.mass, part.position - centre)
         outlines.append(part.position - centre + part.solid.outline @ part.rotation.T)
     return Assembly(mass, centre, 0.5 * (tensor + tensor.T), outlines)
 

@@ -56,8 +56,8 @@ def from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def from_axis(direction: ArrayLike) -> np.ndarray:
-    """The smallest rotation (3, 3) that takes axis 3 to a direction (3,) of any length; from -3 by
-    half a turn about axis 1. It has no rounding for a direction along an axis."""
+    """The smallest rotation (3, 3) that takes axis 3 to a direction (3,) of any length; from 3 to -3
+    it rotates by 180° about axis 1. It has no rounding for a direction along an axis."""
     x, y, z = unit_vector(direction)
     if z < 0:
         return from_axis((-x, -y, -z)) @ np.diag([1.0, -1.0, -1.0])

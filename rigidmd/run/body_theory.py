@@ -19,7 +19,7 @@ class TopMotion(NamedTuple):
 
 
 def heavy_top_motion(
-    across: float, moment: float, momentum: float, cosine: float, transverse: float, turning: float
+    across: float, moment: float, momentum: float, cosine: float, transverse: float, vertical: float
 ) -> TopMotion:
     """The motion of a heavy symmetric top from its state at one time; NaN where numbers are too
     large or small for it.
@@ -29,7 +29,7 @@ def heavy_top_motion(
     momentum : angular momentum along the axis, L3
     cosine : of the angle between the axis and the vertical, u0
     transverse : square of the angular momentum across the axis
-    turning : component of the angular momentum across the axis along the vertical, I1 phi' sin²
+    vertical : component of the angular momentum across the axis along the vertical, I1 phi' sin²
         theta
 
     u = cos theta oscillates between the lower two roots of a cubic (Whittaker, section 71), here in
@@ -38,7 +38,7 @@ def heavy_top_motion(
     """
     from scipy.special import ellipk, elliprf, elliprj  # slow to import
 
-    alpha, kappa, w, c = 2 * moment / across, transverse / across**2, turning / across, momentum / across
+    alpha, kappa, w, c = 2 * moment / across, transverse / across**2, vertical / across, momentum / across
     sine = 1 - cosine * cosine
     cubic = np.array([alpha, 2 * alpha * cosine - kappa - c * c, 2 * (w * c - kappa * cosine) - alpha * sine,
                       kappa * sine - w * w])  # fmt: skip
@@ -54,7 +54,7 @@ def heavy_top_motion(
     angle = 0.0
     for pole in (1.0, -1.0):
         weight, distance = w + c * (cosine - pole), 1 - pole * low
-        # without weight it does not turn about this pole
+        # without weight the axis does not circle this pole
         if distance > 0 and abs(weight) > np.finfo(float).eps * (abs(w) + abs(c)):
             n = pole * (high - low) / distance
             third = elliprf(0, 1 - parameter, 1) + n / 3 * elliprj(0, 1 - parameter, 1, 1 - n)

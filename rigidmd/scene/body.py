@@ -122,7 +122,7 @@ class SolidPart(Solid):
 
     @property
     def rotation(self) -> np.ndarray:
-        """Rotation (3, 3) from the axes of the solid to those of the body."""
+        """Rotation (3, 3) from the axes of the solid to the axes of the body."""
         if self.euler_angles_deg is not None:
             return from_euler_angles(np.radians(self.euler_angles_deg))
         return from_axis(self.axis or (0.0, 0.0, 1.0))

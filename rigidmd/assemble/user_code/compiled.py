@@ -6,25 +6,22 @@ import linecache
 import re
 import traceback
 from collections.abc import Callable, Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rigidmd.compile.cache import PACKAGE
-from rigidmd.compile.kernels import CompileError, compile_user_function
 from rigidmd.core.state import HEAT, TALLY_SIZE, State, no_load
-from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
+from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS, with_checked_indices
+from rigidmd.engines.cpu.engine import CompileError
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError
 from rigidmd.scene.molecules import name_of
 from rigidmd.units import FEMTOSECOND
 
-#: Difference between a change of the kinetic energy and of the ledger that is not rounding, as a fraction of the energy.
+#: Largest difference by rounding between a change of the kinetic energy and of the ledger, as a fraction of the energy.
 LEDGER_ERROR = 1e-9
-
-_compiled = cache(compile_user_function)
 
 
 def check_compiled_code(system: System, state: State) -> list[str]:
@@ -70,10 +67,9 @@ def _thermostats(system: System) -> Iterator[tuple[str, Any, float]]:
 
 def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:
     """The error of a function that cannot be compiled, or reads or writes beyond an array."""
-    compiled = _compiled(function, checks_indices=True)
     arguments_for_python = tuple(part.copy() if isinstance(part, State) else part for part in arguments)
     try:
-        compiled(*arguments)
+        with_checked_indices(function)(*arguments)
     except CompileError as error:
         return [f"{name}: cannot be compiled{describe_compile_error(error)}"]
     except IndexError:
