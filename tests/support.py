@@ -359,6 +359,8 @@ HOMES = {
     "assemble.time_step": "MARGIN MIXED_ERROR error_of_step stable_angle step_error step_warnings",
     "forces.ewald.errors": "charges_in pme_error real_error",
     "run.summary": "ewald_error_notes summarise",
+    "assemble.user_code.compiled": "check_compiled_code",
+    "run.checks": "FailedCheck explain",
     "run.body_theory": "free_body_period heavy_top_motion",
     "run.pilot.trials": "Method IntegratorAccuracy TrialSystem Trial measure time_span",
     "mechanics.translation": "NoTranslation",

@@ -71,7 +71,7 @@ def _faults(name: str, function: Callable, arguments: tuple) -> list[str]:
     try:
         with_checked_indices(function)(*arguments)
     except CompileError as error:
-        return [f"{name}: cannot be compiled{describe_compile_error(error)}"]
+        return [f"{name}: {_place(function)} cannot be compiled{describe_compile_error(error)}"]
     except IndexError:
         hint = "masses and moments are by species: model.mass[model.species[m]]"
         return [f"{name}: {_place_of_index_error(function, arguments_for_python)} has an index beyond an array; {hint}"]
@@ -112,8 +112,9 @@ def describe_compile_error(error: CompileError) -> str:
         return f"{where}: Numba knows no attribute {unknown[1]!r} of {unknown[2]}"
     if unknown := re.findall(r">>> (\S.*)", text):
         return f"{where}: Numba knows no {_short(unknown[-1])}"
-    sentences = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("Failed in")]
-    return f"{where}: {_short(sentences[0] if where and sentences else text.strip().splitlines()[-1])}"
+    sentences = [line.strip() for line in text.splitlines() if line.strip()]
+    causes = [line for line in sentences if not line.startswith(("Failed in", "During"))]
+    return f"{where}: {_short((causes or sentences)[0])}"
 
 
 def _short(text: str) -> str:
