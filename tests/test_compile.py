@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numba
@@ -416,13 +417,11 @@ def test_a_folder_in_which_nothing_is_kept_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for named, expected in (("new", "kept on disk: the next run starts at once"), ("file/x", "RIGIDMD_CACHE names")):
         monkeypatch.setenv("RIGIDMD_CACHE", str(tmp_path / named))
-        cache.cache_folder.cache_clear()
-        cache.shared_folder.cache_clear()
+        cache.cache_folders.cache_clear()
         assert expected in cache.describe_cache()
     assert f"not kept, as {tmp_path / 'file/x'} cannot be written" in cache.describe_cache()
     monkeypatch.undo()
-    cache.cache_folder.cache_clear()
-    cache.shared_folder.cache_clear()
+    cache.cache_folders.cache_clear()
 
 
 def test_nothing_is_made_before_the_first_kernel_is_compiled(tmp_path):
@@ -481,6 +480,139 @@ def test_a_cache_that_cannot_be_written_is_read(kept):
     )
     assert compiled_in(kept / "cache", kept, read_only) == ("42 1", "")
     assert sorted(kept.rglob("*")) == before
+
+
+# --- the index of the cache, which several processes change ----------------------------------------------------------
+
+#: A class in a module that is called like one of the package, but whose file lies elsewhere.
+STRANGE_TERM = """
+import sys, types
+module = types.ModuleType("rigidmd.forces.strange")
+module.__file__ = "/nowhere/strange.py"
+sys.modules[module.__name__] = module
+exec("from typing import NamedTuple\\nclass Term(NamedTuple):\\n    x: float", vars(module))
+"""
+SUM = "from rigidmd.compile import kernel\n@kernel(from_python=True)\ndef double(x):\n    return x[0] + x[0]\n"
+
+
+def hits_with(tmp_path, before: str, value: str) -> int:
+    """How often a process reads the code of a kernel for a value from the cache."""
+    (tmp_path / "sums.py").exists() or (tmp_path / "sums.py").write_text(SUM)
+    script = f"{before}\nfrom sums import double; double({value}); print(sum(double.stats.cache_hits.values()))"
+    environment = os.environ | {
+        "RIGIDMD_CACHE": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(map(str, (ROOT, tmp_path))),
+    }  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    return int(done.stdout)
+
+
+def test_kernels_are_found_after_a_process_with_a_module_that_others_lack(tmp_path):
+    assert hits_with(tmp_path, "", "(1.0,)") == 0
+    assert hits_with(tmp_path, STRANGE_TERM, "module.Term(1.0)") == 0
+    assert hits_with(tmp_path, "", "(1.0,)") == 1
+    assert hits_with(tmp_path, "", "(1,)") == 0
+    assert hits_with(tmp_path, "", "(1,)") == 1
+
+
+def test_an_index_that_cannot_be_read_is_not_replaced(tmp_path):
+    as_ours = f"{STRANGE_TERM}\nfrom rigidmd.compile import cache; cache._is_of_package = lambda module: True"
+    assert hits_with(tmp_path, as_ours, "module.Term(1.0)") == 0
+    assert hits_with(tmp_path, "", "(1.0,)") == 0
+    assert hits_with(tmp_path, as_ours, "module.Term(1.0)") == 1
+
+
+def test_an_index_loses_nothing_that_is_stored_at_the_same_time(tmp_path):
+    keys = [((types.UniTuple(types.float64, n),), ()) for n in range(1, 25)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda key: CacheIndex(str(tmp_path), "f", 0).save(key, f"code {key}"), keys))
+    found = [CacheIndex(str(tmp_path), "f", 0).load(key) for key in keys]
+    assert found == [f"code {key}" for key in keys]
+
+
+# --- folders of others -----------------------------------------------------------------------------------------------
+
+
+def folders_of(cache, ending):
+    """The folders from the cache to its file of the kernel, and that file."""
+    (path,) = (path for path in cache.rglob(f"*twice*{ending}*") if ending in path.name)
+    return [cache, path.parent.parent, path.parent, path]
+
+
+@pytest.mark.parametrize(
+    ("which", "bits", "ending"), [(0, 0o020, ".nbi"), (1, 0o002, ".nbi"), (2, 0o020, ".nbi"), (3, 0o002, ".nbc")]
+)
+def test_code_that_others_may_write_is_not_used(which, bits, ending, kept, tmp_path):
+    shutil.copytree(kept / "cache", tmp_path / "cache")
+    path = folders_of(tmp_path / "cache", ending)[which]
+    path.chmod(path.stat().st_mode | bits)
+    printed, warned = compiled_in(tmp_path / "cache", kept)
+    assert printed == "42 0"
+    assert warned.count("may be written by others (chmod go-w forbids that)") == 1
+
+
+@pytest.mark.parametrize("which", [1, 3])
+def test_code_of_another_user_is_not_used(which, kept, tmp_path):
+    shutil.copytree(kept / "cache", tmp_path / "cache")
+    path = folders_of(tmp_path / "cache", ".nbi")[which]
+    before = f"""
+import os, rigidmd.core.files as files
+true = files.untrusted_reason
+def of_another(found):
+    fields = list(found)
+    fields[4] += 1000 * (found.st_ino == {path.stat().st_ino})
+    return true(os.stat_result(fields))
+files.untrusted_reason = of_another
+"""
+    printed, warned = compiled_in(tmp_path / "cache", kept, before)
+    assert printed == "42 0" and warned.count("belongs to another user") == 1
+
+
+def test_code_behind_a_link_in_the_cache_is_not_used(kept, tmp_path):
+    shutil.copytree(kept / "cache", tmp_path / "cache")
+    (tmp_path / "cache").rename(tmp_path / "other")
+    (tmp_path / "cache").symlink_to(tmp_path / "other")  # the user's own choice of a folder
+    assert compiled_in(tmp_path / "cache", kept) == ("42 1", "")
+    kernels = folders_of(tmp_path / "other", ".nbi")[1]
+    kernels.rename(tmp_path / "elsewhere")
+    kernels.symlink_to(tmp_path / "elsewhere")
+    printed, warned = compiled_in(tmp_path / "cache", kept)
+    assert printed == "42 0" and "is a link" in warned
+
+
+@pytest.mark.parametrize("home", ["raise RuntimeError('no home')", "return '~/.cache/rigidmd'"])
+def test_without_a_home_folder_the_cache_is_a_temporary_one(home, tmp_path):
+    """Relative to the working directory it could hold code of others."""
+    script = (
+        f"import platformdirs\ndef path(name):\n    {home}\nplatformdirs.user_cache_path = path\n"
+        "from rigidmd.compile import cache\n"
+        "print(cache.describe_cache(), cache.is_persistent(), cache.cache_folder())"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "RIGIDMD_CACHE"}
+    environment |= {"TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    (tmp_path / "here").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, cwd=tmp_path / "here", capture_output=True, text=True
+    )
+    assert "not kept, as this user has no home folder: the next run compiles again" in done.stdout, done.stderr
+    assert f" False {tmp_path}/rigidmd-cache-" in done.stdout
+    assert list((tmp_path / "here").iterdir()) == [] and list(tmp_path.glob("rigidmd-cache-*")) == []
+
+
+@pytest.mark.parametrize(
+    "function", ["IndexDataCacheFile._open_for_write", "tempfile.TemporaryFile", "tempfile.mkdtemp"]
+)
+def test_a_full_disk_costs_time_only(function, tmp_path):
+    full = (
+        "import tempfile, numba\nfrom numba.core.caching import IndexDataCacheFile\nimport rigidmd.compile\n"
+        "def full(*where, **named):\n    raise OSError(28, 'No space left on device')\n"
+        f"{function} = full\n"
+    )
+    if function == "tempfile.mkdtemp":  # neither in the cache nor elsewhere
+        full += "tempfile.TemporaryFile = full\n"
+    printed, warned = compiled_in(tmp_path / "cache", tmp_path, full)
+    assert printed == "42 0"
+    assert warned.count("No space left on device") == (function == "IndexDataCacheFile._open_for_write")
+    assert "Traceback" not in warned
 
 
 def test_a_kernel_is_compiled_once_for_all_constant_arguments():

@@ -1,6 +1,7 @@
 """In a notebook: progress, what values show, figures of columns, films, a plot of a run that goes on, the tutorial."""
 
 import base64
+import contextlib
 import json
 import re
 import sys
@@ -86,7 +87,14 @@ class Balance(HTMLParser):
             assert self.open.pop() == tag
 
 
-def test_a_notebook_shows_the_bar_in_one_place(cell, capsys):
+@contextlib.contextmanager
+def compiling_something(announce):
+    announce()
+    yield
+
+
+def test_a_notebook_shows_the_bar_in_one_place(cell, capsys, monkeypatch):
+    monkeypatch.setattr("rigidmd.run.loop.compiling_announced", compiling_something)
     Simulation(top()).run()
     (shown,) = cell
     assert shown[0]["text/plain"] == "compiling (kept on disk: the next run starts at once) ..."
@@ -98,7 +106,7 @@ def test_a_notebook_shows_the_bar_in_one_place(cell, capsys):
     Simulation(top()).run(progress=False)
     assert len(cell) == 1
     said = []
-    Simulation(top(), say=said.append).run()
+    Simulation(top(), say=said.append).run()  # a compiling announcement, and no bar
     assert len(said) == 1
     assert "compiling" not in cell[1][0]["text/plain"]
     assert capsys.readouterr() == ("", "")
@@ -110,7 +118,8 @@ def test_a_bar_that_ends_early_waits_for_nothing(cell):
     assert re.fullmatch(r"40 %: 40 of 100 iterations, 00:00", cell[0][-1]["text/plain"])
 
 
-def test_elsewhere_progress_is_asked_for(capsys):
+def test_elsewhere_progress_is_asked_for(capsys, monkeypatch):
+    monkeypatch.setattr("rigidmd.run.loop.compiling_announced", compiling_something)
     Simulation(top()).run()
     assert capsys.readouterr() == ("", "")
     Simulation(top()).run(progress=True)

@@ -31,12 +31,12 @@ EXAMPLES = """examples:
 """
 
 #: What the loader of shared libraries and the system report where memory does not suffice.
-OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
+OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command. Exit code: 0 success, 1 failed run, 2 bad input, 75 wall time is up, 130 or 143 signal."""
-    from rigidmd.core.process import format_gigabytes, free_memory
+    from rigidmd.core.process import check_address_space, without_local_settings
 
     options = argparse.Namespace()
     # Nothing of what is imported is garbage: the search for it took a quarter of a short run, most of it at the exit.
@@ -49,7 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         open_streams()
         options = _parse(sys.argv[1:] if arguments is None else arguments)
-        with warnings.catch_warnings(), checked_streams(lasting=options.writes):
+        check_address_space()
+        with warnings.catch_warnings(), without_local_settings(), checked_streams(lasting=options.writes):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
     except RigidMDError as error:
@@ -65,13 +66,23 @@ def main(arguments: list[str] | None = None) -> int:
             print("rigidmd: interrupted", file=sys.stderr)
             return INTERRUPTED
         if any(isinstance(cause, MemoryError) for cause in causes):  # zipfile, too, raises another one instead
-            what, free = getattr(options, "scene", "this"), format_gigabytes(free_memory())
-            print(f"rigidmd: {what}: not enough memory ({free} free); take fewer molecules or samples", file=sys.stderr)
+            what = getattr(options, "scene", "this")
+            print(f"rigidmd: {what}: not enough memory{_free()}; take fewer molecules or samples", file=sys.stderr)
             return BAD_INPUT
         if any(words in str(cause) for cause in causes for words in OUT_OF_MEMORY):
             print("rigidmd: not enough memory to load the program; raise the limit (ulimit -v)", file=sys.stderr)
             return BAD_INPUT
         raise
+
+
+def _free() -> str:
+    """How much memory is free, for messages; empty if not even that can be found out."""
+    from rigidmd.core.process import format_gigabytes, free_memory
+
+    try:
+        return f" ({format_gigabytes(free_memory())} free)"
+    except MemoryError:
+        return ""
 
 
 def _parse(words: list[str]) -> argparse.Namespace:

@@ -17,12 +17,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
-from filelock import FileLock, Timeout
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -31,9 +29,10 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
 
 from rigidmd.compile import thread_pool
-from rigidmd.compile.cache import cache_folder, is_persistent
+from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
+from rigidmd.core.process import python_process
 from rigidmd.errors import SettingError
 
 # --- values in memory ------------------------------------------------------------------------------------------------
@@ -151,9 +150,7 @@ class CompiledTask:
         """
         if not self.is_ready(arguments_type):
             digest = hashlib.sha256(repr((self.name, arguments_type)).encode()).hexdigest()[:16]
-            with contextlib.ExitStack() as held:
-                with contextlib.suppress(OSError, Timeout):
-                    held.enter_context(FileLock(Path(cache_folder()) / f"{digest}.lock", timeout=LONGEST_WAIT))
+            with lock_in_cache(digest, LONGEST_WAIT):
                 code = compile_callback(self.function, (arguments_type, types.intp), self.options)
             self.compiled.setdefault(arguments_type, code)  # the code of another thread may already be in use
         return self.compiled[arguments_type].address
@@ -312,11 +309,8 @@ _compiling = threading.RLock()
 _collected: ContextVar[list[tuple[CompiledTask, TaskArguments]] | None] = ContextVar("collected", default=None)
 #: Least number of tasks for a second process; for fewer, importing the package there takes longer.
 FEWEST_TASKS = 3
-#: Program of the second process, which finds the package with the same search path.
-SECOND_PROGRAM = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from rigidmd.compile import code; code.compile_requested()"
-)  # fmt: skip
+#: Program of the second process.
+SECOND_PROGRAM = "from rigidmd.compile import code; code.compile_requested()"
 
 
 def compile_together(make: Callable[[], object]) -> None:
@@ -349,9 +343,9 @@ def second_process(wanted: Sequence[tuple[str, str, TaskArguments]]) -> Iterator
     """Within the block a second process compiles tasks (module, name, type), unless their types cannot be pickled."""
     process = None
     with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
-        content = pickle.dumps(sys.path) + pickle.dumps(wanted)
+        content = pickle.dumps(wanted)
         process = subprocess.Popen(
-            [sys.executable, "-c", SECOND_PROGRAM], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            **python_process("-c", SECOND_PROGRAM), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C goes to this process, which then ends the other
         )  # fmt: skip
         assert process.stdin is not None

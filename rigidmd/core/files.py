@@ -38,6 +38,26 @@ def unreadable_reason(path: Path, largest: float = inf) -> str:
     return ""
 
 
+def untrusted_reason(found: os.stat_result) -> str:
+    """Why a file or folder may have been written by others than this user and root; empty if it cannot.
+
+    found : of `os.lstat` or `os.fstat`. Systems without user numbers have no such check.
+    """
+    if not hasattr(os, "geteuid"):
+        return ""
+    if stat.S_ISLNK(found.st_mode):
+        return "is a link"
+    if found.st_uid not in (os.geteuid(), 0):
+        return "belongs to another user"
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return "may be written by others (chmod go-w forbids that)"
+    return ""
+
+
+class LostFileError(OutputError):
+    """A file of a run was removed, replaced or changed by another program while the run was writing it."""
+
+
 @contextlib.contextmanager
 def writing(path: Path, what: str = "written", hint: str = "") -> Iterator[None]:
     """Within it an OSError becomes an OutputError: PATH cannot be `what`, the reason, and a hint."""
@@ -118,10 +138,24 @@ class AppendedFile:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Size in bytes, after flushing to the disk, and the CRC-32 of the appended records."""
+        """Size in bytes, after flushing to the disk, and the CRC-32 of the appended records. Raises OutputError, see
+        `check` too."""
         with writing(self._path):
             os.fsync(self._file.fileno())
+        self.check()
         return self._size, self._sum
+
+    def check(self) -> None:
+        """Raise LostFileError if the file that is being written is no longer the one at its path."""
+        ours = os.fstat(self._file.fileno())
+        try:
+            found = self._path.lstat()
+        except OSError:
+            raise LostFileError(f"{self._path} was removed while the run was writing it") from None
+        if (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino):
+            raise LostFileError(f"{self._path} was replaced by another file while the run was writing it")
+        if ours.st_size != self._size:
+            raise LostFileError(f"{self._path} was changed by another program while the run was writing it")
 
     def append(self, piece: bytes) -> None:
         """Append a record."""

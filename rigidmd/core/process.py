@@ -1,11 +1,16 @@
-"""Settings and memory of the process, which runs in several threads share."""
+"""Settings and memory of the process, which runs in several threads share, and other processes of Python."""
 
 import contextlib
+import os
+import sys
 import threading
 import warnings
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path
+from typing import Any
+
+from rigidmd.errors import SettingError
 
 #: Held while settings of the process change temporarily, and while a run compiles, which changes some too. A thread
 #: that holds it may wait for the locks of Numba and of `compile`, but not the other way round.
@@ -20,10 +25,47 @@ def ignore_warnings() -> Iterator[None]:
         yield
 
 
+#: Configuration files that libraries read in the working directory: Numba and Matplotlib.
+LOCAL_SETTINGS = (".numba_config.yaml", "matplotlibrc")
+
+
+@contextlib.contextmanager
+def without_local_settings() -> Iterator[None]:
+    """Within the block, libraries do not find their configuration files in the working directory.
+
+    A folder from others could otherwise change results by such a file, or stop a run. The libraries have no setting for
+    this. Both look for the file by `os.path.exists`, which is replaced for all threads. A program keeps it replaced
+    until its end.
+    """
+    exists = os.path.exists
+
+    def exists_elsewhere(path: Any) -> bool:
+        return path not in LOCAL_SETTINGS and exists(path)
+
+    os.path.exists = exists_elsewhere
+    try:
+        yield
+    finally:
+        os.path.exists = exists
+
+
+def python_process(*arguments: str) -> dict[str, Any]:
+    """Arguments of `subprocess.Popen` for a process of Python with the search path of this one.
+
+    The process does not import from the working directory (`-P`), where a file of others may be called `json.py`. It
+    finds this package in any case.
+    """
+    entries = [os.path.abspath(entry) for entry in sys.path if entry]
+    path = os.pathsep.join([*entries, str(Path(__file__).parents[2])])
+    return {"args": [sys.executable, "-P", *arguments], "env": os.environ | {"PYTHONPATH": path}}
+
+
 try:
     import resource
 except ImportError:  # on Windows
     resource = None
+#: Bytes of address space to load all libraries. With less they fail in many ways, and OpenBLAS may hang.
+LIBRARY_BYTES = 1e9
 RESERVED = 0.05  # fraction of the free memory that is reserved for Python, machine code and files
 
 
@@ -54,6 +96,16 @@ def address_space_left() -> float:
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     used = 1024 * _system_number("/proc/self/status", "VmSize:", 0.0)
     return inf if soft == resource.RLIM_INFINITY else soft - used
+
+
+def check_address_space() -> None:
+    """Raise SettingError if the libraries cannot be loaded within the limit of this process (`ulimit -v`)."""
+    if "numba" in sys.modules or (left := address_space_left()) >= LIBRARY_BYTES:
+        return
+    raise SettingError(
+        f"not enough memory: the program and its libraries need {format_gigabytes(LIBRARY_BYTES)} of addresses, and "
+        f"the limit of this process leaves {format_gigabytes(left)}; raise it (ulimit -v)"
+    )
 
 
 def _system_number(file: str, label: str = "", absent: float = inf) -> float:

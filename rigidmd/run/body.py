@@ -11,7 +11,6 @@ from pydantic import PositiveFloat
 
 from rigidmd.assemble.body import build_body
 from rigidmd.assemble.time_step import stable_angle
-from rigidmd.compile.cache import describe_cache
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
 from rigidmd.engines.body_motion import Motion, Snapshot, energies, is_balanced, motion
@@ -238,7 +237,6 @@ class BodyRun(RunPart):
         self.state = self.engine.begin(self.system.state, self.system.method)
 
     def prepare(self) -> None:
-        self.simulation.announce(f"compiling ({describe_cache()})")
         system, run, compiled = self.system, self.scene.run, self.system.engine()
         compiled.advance(compiled.begin(system.state, system.method), system.method, run.timestep_s, 0)
         rate, angle = fastest_body_rate(system), stable_angle(system.method)

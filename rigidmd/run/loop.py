@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidmd.compile.cache import compiling_announced, describe_cache
 from rigidmd.core.files import writing
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
@@ -145,7 +146,8 @@ class RunLoop:
                 inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
                 run_folder.check_folder(self._folder, self._force, inputs, names)
             if kept is None:
-                with interruptible(), PROCESS_LOCK:  # of several runs one compiles, and the others read its cache
+                # of several runs one compiles, and the others read its cache
+                with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
                     part.prepare()
             preparing = clock.perf_counter() - began
             for observer in observers:
@@ -186,6 +188,9 @@ class RunLoop:
                         with contextlib.suppress(Exception):  # the first error is the one to report
                             observer.failed(simulation)
                 raise
+
+    def _announce_compiling(self) -> None:
+        self._simulation.announce(f"compiling ({describe_cache()})")
 
     def _if_not_forked(self, function: Callable[[], object]) -> None:
         """Call a function unless this is a forked process: files and locks belong to the process that was forked."""

@@ -13,7 +13,6 @@ from rigidmd.assemble.build import build, integrator_of_stage
 from rigidmd.assemble.time_step import stable_angle
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.assemble.user_code.compiled import check_compiled_code
-from rigidmd.compile.cache import describe_cache
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, REMOVED, WORK, State, state_of
@@ -178,7 +177,6 @@ class MolecularRun(RunPart):
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
-        self.simulation.announce(f"compiling ({describe_cache()})")
         system, scene, first = self.system, self.scene, self.scene.stages[0]
         for note in check_compiled_code(system, self.state):
             self.simulation.note(note)

@@ -97,7 +97,7 @@ def _live_page(name: str) -> Path:
     """The page that `rigidmd view` writes of a run of a shipped scene."""
     folder = Path(tempfile.mkdtemp())
     for command in (("new", name), ("run", f"{name}.toml", "-o", "run", *LIVE[name]), ("view", "run")):
-        subprocess.run([sys.executable, "-m", "rigidmd", *command], cwd=folder, check=True)
+        subprocess.run([sys.executable, "-P", "-m", "rigidmd", *command], cwd=folder, check=True)
     return next((folder / "run").glob("*.html"))
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.core.process import ignore_warnings
+from rigidmd.core.process import ignore_warnings, python_process
 from rigidmd.core.state import edges_and_angles
 from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import Frame, structure_error
@@ -98,9 +98,8 @@ def read_in_process(
         target = Path(folder) / "frame.npz"
         arguments = [pickle.dumps(read).hex(), str(path), str(frame), str(atoms), str(target)]
         ended = subprocess.run(
-            [sys.executable, "-P", *PROGRAM, *arguments], stdin=subprocess.DEVNULL, capture_output=True, check=False,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )  # fmt: skip
+            **python_process(*PROGRAM, *arguments), stdin=subprocess.DEVNULL, capture_output=True, check=False
+        )
         if ended.returncode < 0 or not target.is_file():
             reason = "its reader crashed" if ended.returncode < 0 else ended.stderr.decode(errors="replace")[-300:]
             raise structure_error(path, f"cannot be read as a trajectory: {reason}. Is it damaged?")

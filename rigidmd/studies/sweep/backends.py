@@ -30,6 +30,7 @@ from typing import Any, TypedDict
 from filelock import FileLock, Timeout
 
 from rigidmd.core.files import write_text, writing
+from rigidmd.core.process import python_process, without_local_settings
 from rigidmd.errors import OutputError, RigidMDError, SettingError
 from rigidmd.io.folder import LOCK
 from rigidmd.studies.sweep.folder import STOP, State, SweepPoint, state_on_disk
@@ -73,11 +74,11 @@ class Worker:
     def __init__(self, threads: int, folder: str | None = None):
         counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the process lives)
+        python = python_process("-m", "rigidmd.studies.sweep.backends")
         # In a separate session: Ctrl-C goes only to its parent, which ends it with a checkpoint
         self._process: Any = subprocess.Popen(
-            [sys.executable, "-m", "rigidmd.studies.sweep.backends"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, env=os.environ | counts, cwd=folder,
-            start_new_session=True,
+            python["args"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr,
+            env=python["env"] | counts, cwd=folder, start_new_session=True,
         )  # fmt: skip
 
     def run(self, task: PointTask, must_stop: Callable[[], bool], send: Send) -> PointResult:
@@ -356,4 +357,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with without_local_settings():
+        main()
