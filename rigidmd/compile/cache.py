@@ -177,7 +177,7 @@ def describe_cache() -> str:
 def lock_in_cache(name: str, longest_wait: float) -> Iterator[None]:
     """Hold a lock of this name within the block, against other processes and threads.
 
-    Where there is no lock, because the file system has none or the wait is over, the block runs without it.
+    On a file system without locks, or after the wait, the block runs without it.
     """
     with contextlib.ExitStack() as held:
         if folder := cache_folder():

@@ -146,7 +146,7 @@ class AppendedFile:
         return self._size, self._sum
 
     def check(self) -> None:
-        """Raise LostFileError if the file that is being written is no longer the one at its path."""
+        """Raise LostFileError if the file that is being written was removed, replaced or changed by another program."""
         ours = os.fstat(self._file.fileno())
         try:
             found = self._path.lstat()
