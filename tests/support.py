@@ -299,7 +299,7 @@ HOMES = {
     "analysis.built_in.rotation": "PER_CM dielectric orientation spectrum total_dipole",
     "io.formats.atoms": "Frame element_of element_of_mass",
     "assemble.body": "build_body",
-    "io.formats.cells": "describe_basis basis_of nearest_images pairs_within reduced_cell standard_rotation",
+    "io.formats.cells": "describe_basis basis_of least_skewed_cell nearest_images pairs_within reduced_cell standard_rotation",
     "assemble.describe": "describe",
     "io.formats": "BY_EXTENSION",
     "io.formats.gsd": "GsdFile GsdReader",

@@ -32,8 +32,11 @@ NO_MASS = 0.1
 SEARCH_TOLERANCE = 3
 MOST_SEARCHED = 5  # of these molecules
 MOST_LISTED = 6  # atoms of a molecule in a message
-#: Of two species, mirror images or ways to assign atoms one is better if its rms deviation is less than this fraction
-#: of the other. Fits closer than this fraction of the radius are not compared.
+#: If two species fit, the better one is taken if its rms deviation is less than this fraction of the other's: as models
+#: of water that differ, a .gro has 0.004 and 0.05 Å.
+EXACTLY = 0.1
+#: A mirror image or another order is noted if its rms deviation is less than this fraction of the deviation of a
+#: molecule, which is more than the second fraction of the radius.
 CLEARLY_BETTER, CLOSE_FIT = 0.5, 0.02
 
 
@@ -319,7 +322,7 @@ class _Matcher:
         chosen, fitting = rms.argmin(axis=0), np.isfinite(rms)
         clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
         least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance
-        doubtful = (fitting.sum(axis=0) > 1) & (least >= CLEARLY_BETTER * clear)
+        doubtful = (fitting.sum(axis=0) > 1) & (least >= EXACTLY * clear)
         for row, m in enumerate(members):
             if doubtful[row]:
                 names = " or ".join(self._name(g) for g, fits in zip(groups, fitting[:, row], strict=True) if fits)

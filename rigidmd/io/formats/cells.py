@@ -1,7 +1,7 @@
 """Periodic cells of any shape and orientation, as in structure files. Rows a, b, c, lab frame, Å."""
 
 import contextlib
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 
@@ -13,10 +13,13 @@ RIGHT = np.radians(1e-3)
 ORIENTED = 1e-6
 
 #: Tolerated tilt beyond half an edge, as a fraction of the edge: 36 cos 60° is 18.000000000000004, and vectors in files
-#: have 1e-4 Å, angles 0.01 degrees. Neighbour lists are correct for any tilt.
-HALF_AS_PRINTED = 1e-4
-#: The cell is rotated for another choice of edges if that raises the longest possible cutoff by this factor.
-CUTOFF_GAIN = 1.1
+#: have 1e-3 Å at best, angles 0.01 degrees. Neighbour lists are correct for any tilt.
+HALF_AS_PRINTED = 4e-4
+#: The cell is rotated for another choice of edges if that raises the longest possible cutoff by this factor. In rhombic
+#: dodecahedra (fcc lattices), of which programs use several cells, the factor is 2/sqrt(3) = 1.155 at most.
+CUTOFF_GAIN = 1.25
+#: Heights of cells that differ by less than this fraction are equal.
+SAME_HEIGHT = 2e-3
 #: Smallest thickness and longest edge of a cell, Å: half an atom, a tenth of a metre.
 THINNEST, LONGEST = 0.5, 1e9
 
@@ -51,7 +54,8 @@ def reduced_cell(cell: np.ndarray) -> np.ndarray:
     for k, along in ((2, 1), (2, 0), (1, 0)):
         edges = cell[k, along] / cell[along, along]
         if abs(edges) > 0.5 + HALF_AS_PRINTED:
-            cell[k] -= np.rint(edges) * cell[along]
+            # halves become +0.5, whatever their last digit
+            cell[k] -= np.ceil(edges - 0.5 - HALF_AS_PRINTED) * cell[along]
     return cell
 
 
@@ -87,15 +91,43 @@ def describe_basis(basis: np.ndarray) -> str:
 
 
 def least_skewed_cell(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (3, 3) of a lattice that allows the longer cutoff, and the rotation (3, 3) to its standard orientation:
-    the given cell with reduced tilts, unless the Minkowski-reduced one allows a much longer cutoff (half the smallest
-    of a_x, b_y, c_z)."""
+    """The cell (3, 3) of a lattice that allows the longer cutoff (half the smallest of a_x, b_y, c_z), and the rotation
+    (3, 3) to its standard orientation: the given cell with reduced tilts, unless another one allows a much longer
+    cutoff. The choice does not depend on the rounding of numbers in files."""
+    given = reduced_cell(cell)
+    bases = _short_bases(cell)
+    standard = np.abs(np.linalg.qr(np.swapaxes(bases @ cell, 1, 2), mode="r"))  # columns a, b, c
+    heights = standard.diagonal(axis1=1, axis2=2)
+    height = heights.min(axis=1)
+    if height.max() <= CUTOFF_GAIN * np.diag(given).min():
+        return given, np.eye(3)
+    # of those that are equally high, without large tilts, and with the fewest changes
+    tilt = (standard / heights[:, :, None])[:, [0, 0, 1], [1, 2, 2]].max(axis=1)
+    changes = np.abs(bases - np.eye(3, dtype=int)).sum(axis=(1, 2))
+    best = np.flatnonzero(height >= (1 - SAME_HEIGHT) * height.max())
+    basis = bases[min(best, key=lambda k: (tilt[k] > 0.5 + HALF_AS_PRINTED, changes[k], bases[k].tolist()))]
+    other, rotation = standard_rotation(basis @ cell)
+    return reduced_cell(other), rotation
+
+
+def _short_bases(cell: np.ndarray) -> np.ndarray:
+    """Right-handed bases (k, 3, 3) of a lattice, integers in terms of its cell (3, 3), of its shortest vectors: those
+    not longer than the longest of a reduced cell, of which a lattice may have several."""
     from ase.geometry import minkowski_reduce
 
-    given = reduced_cell(cell)
-    other, rotation = standard_rotation(np.asarray(minkowski_reduce(cell)[0]))
-    other = reduced_cell(other)
-    return (other, rotation) if np.diag(other).min() > CUTOFF_GAIN * np.diag(given).min() else (given, np.eye(3))
+    edges, reduced = minkowski_reduce(cell)
+    factors = np.array([v for v in product((-2, -1, 0, 1, 2), repeat=3) if v > (0, 0, 0)])  # without -v
+    vectors = factors @ np.asarray(reduced)
+    longest = np.linalg.norm(edges, axis=1).max()
+    vectors = vectors[np.linalg.norm(vectors @ cell, axis=1) <= (1 + SAME_HEIGHT) * longest]
+    vectors *= np.sign(vectors[np.arange(len(vectors)), (vectors != 0).argmax(axis=1)])[:, None]
+    i, j, k = np.array(list(permutations(range(len(vectors)), 3))).T
+    volume = (np.cross(vectors[i], vectors[j]) * vectors[k]).sum(axis=1)
+    whole = np.abs(volume) == 1
+    bases = np.stack([vectors[of[whole]] for of in (i, j, k)], axis=1)
+    signs = np.array([s for s in product((1, -1), repeat=3)])
+    bases = (bases[:, None] * signs[:, :, None]).reshape(-1, 3, 3)
+    return bases[np.linalg.det(bases) > 0]
 
 
 def right_angled(cell: np.ndarray) -> bool:
