@@ -1427,14 +1427,39 @@ DATA = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["a.data", "data.spce", "water.dat", "input_structure_data.spce", "a.data.gz"])
+#: Tilts xy, xz, yz of LAMMPS' boxes: the extremes of the bounds of dumps are at different corners.
+TILTS = [None, (3.0, -2.0, 4.0), (3.0, 2.0, 4.0), (-3.0, -2.0, -4.0), (-3.0, 5.0, -4.0)]
+
+
 @pytest.mark.parametrize("case", DATA)
-def test_lammps_data_as_people_write_it(case, name, tmp_path):
-    content = DATA[case].encode()
+def test_lammps_data_as_people_write_it(case, tmp_path):
+    names = ["a.data", "data.spce", "water.dat", "input_structure_data.spce", "a.data.gz"]
+    name, content = names[list(DATA).index(case) % len(names)], DATA[case].encode()
     (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
     found = read_structure(tmp_path / name, [SPECIES["spce"]], None, True, TOLERANCE)
     same_molecules(found, WATER_DATA, [SPECIES["spce"]], 1e-8)
     assert found.notes == ()
+
+
+@pytest.mark.parametrize("tilts", TILTS[1:])
+@pytest.mark.parametrize("bounds", [(0.0, 0.0, 0.0), (-5.0, 2.0, 31.0)])
+@pytest.mark.parametrize("general", [False, True])
+def test_tilted_boxes_of_lammps_data(tilts, bounds, general, tmp_path):
+    """By bounds and tilts, or by three edges; split atoms are in the box."""
+    xy, xz, yz = tilts
+    truth = Truth(["spce"] * 8, 23, cell=[[15.0, 0, 0], [xy, 16.0, 0], [xz, yz, 17.0]])
+    truth.centre += bounds
+    text = data_of(truth)
+    box = re.search(r"0 .* xlo xhi\n.*\n.* zlo zhi\n", text)[0]
+    lines = [
+        f"{low} {low + edge} {axis}lo {axis}hi\n" for low, edge, axis in zip(bounds, (15, 16, 17), "xyz", strict=True)
+    ]
+    lines.append(f"{xy} {xz} {yz} xy xz yz\n")
+    if general:
+        lines = [f"{' '.join(map(str, edge))} {name}vec\n" for edge, name in zip(truth.cell, "abc", strict=True)]
+    found = read(tmp_path, text.replace(box, "".join(lines)), "a.data")
+    assert found.cell == pytest.approx(truth.cell)
+    same_molecules(found, truth, [SPECIES["spce"]], 1e-7)
 
 
 @pytest.mark.parametrize(
@@ -1473,14 +1498,15 @@ def test_images_of_lammps_atoms(tmp_path):
 def dump_of(truth, columns, flags="pp pp pp", units="") -> str:
     """A dump with these columns, atoms in another order."""
     cell, types, rows = truth.cell, {"O": 1, "H": 2, "X": 3}, []
-    for i, (name, e, k, x, v) in enumerate(truth.atoms(), 1):
+    for i, (_, e, k, x, v) in enumerate(truth.atoms(), 1):
         scaled = (x - [1, 2, 3]) @ np.linalg.inv(cell)
         values = {
             "id": i,
             "mol": k + 1,
             "type": types[e],
             "element": e,
-            "name": name,
+            "typelabel": {"O": "OW", "H": "HW", "X": "MW"}[e],
+            "label": {"O": "OW", "H": "HW", "X": "MW"}[e],
             "mass": {"O": 15.9994, "H": 1.008, "X": 1e-8}[e],
         }
         values |= dict(zip(("x", "y", "z"), x, strict=True)) | dict(zip(("xs", "ys", "zs"), scaled, strict=True))
@@ -1512,29 +1538,39 @@ def dump_of(truth, columns, flags="pp pp pp", units="") -> str:
         "id type mass xs ys zs",
         "type x y z",
         "id type vx vy vz x y z",
+        "id typelabel xs ys zs",
+        "id type typelabel x y z",
+        "id label xu yu zu",
     ],
 )
-@pytest.mark.parametrize("name", ["a.lammpstrj", "dump.water", "a.dump", "a.lammpstrj.gz"])
-@pytest.mark.parametrize("slanted", [False, True])
-def test_lammps_dumps(columns, name, slanted, tmp_path):
-    truth = Truth(["tip4p2005"] * 8, 25, cell=[[15.0, 0, 0], [3.0, 16.0, 0], [-2.0, 4.0, 17.0]] if slanted else None)
+@pytest.mark.parametrize("tilts", TILTS)
+def test_lammps_dumps(columns, tilts, tmp_path):
+    xy, xz, yz = tilts or (0.0, 0.0, 0.0)
+    truth = Truth(["tip4p2005"] * 8, 25, cell=[[15.0, 0, 0], [xy, 16.0, 0], [xz, yz, 17.0]])
     second = Truth(["tip4p2005"] * 5, 26)
+    path = tmp_path / ("a.lammpstrj.gz" if tilts is None else "dump.water")
     content = (dump_of(truth, columns, units="real") + dump_of(second, columns)).encode()
-    (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
+    path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
     names = {"1": "O", "2": "H", "3": "MW"}
-    told = not {"element", "mass"} & set(columns.split())
+    told = not {"element", "mass", "label", "typelabel"} & set(columns.split())
     species = [SPECIES["tip4p2005"]]
     for frame, there in ((1, truth), (2, second)):
-        found = read_structure(
-            tmp_path / name, species, None, True, TOLERANCE, frame, atom_types=names if told else None
-        )
+        found = read_structure(path, species, None, True, TOLERANCE, frame, atom_types=names if told else None)
         partner = same_molecules(found, there, species, 1e-6)
         assert found.cell == pytest.approx(there.cell, abs=1e-6)
         if "vx" in columns:
             assert found.velocity == pytest.approx(there.velocity[partner], abs=1e-6)
+        assert not any("left out" in note or "missing" in note for note in found.notes)
     if told:
         with pytest.raises(StructureError, match=r"has only types of atoms.*structure.atom_types"):
-            read_structure(tmp_path / name, species, None, True, TOLERANCE, 1)
+            read_structure(path, species, None, True, TOLERANCE, 1)
+
+
+@pytest.mark.parametrize("columns", ["id typelabel x y z", "id type typelabel x y z", "id label x y z"])
+def test_labels_of_a_dump_are_named_by_atom_types(columns, tmp_path):
+    text = dump_of(WATER_DATA, columns).replace(" OW ", " water_O ").replace(" HW ", " +h ")
+    found = read(tmp_path, text, "a.dump", atom_types={"water_O": "O", "+h": "H"})
+    same_molecules(found, WATER_DATA, [SPECIES["spce"]], 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -1543,6 +1579,10 @@ def test_lammps_dumps(columns, name, slanted, tmp_path):
         (("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type q"), "line 9: has no columns of coordinates"),
         (("ITEM: NUMBER OF ATOMS\n24", "ITEM: NUMBER OF ATOMS\n25"), "line 4 promises 25 atoms, 24 are there"),
         (("ITEM: ATOMS id type x y z", "ITEM: ATOMS id type x y z ix"), "line 10: expected 6 columns"),
+        (
+            ("ITEM: ATOMS id type x y z", "ITEM: ATOMS id q x y z"),
+            "line 9: has no column that names its atoms: type, typel",
+        ),
         (("ITEM: NUMBER OF ATOMS", "ITEM: NUMBER"), "line 1: expected ITEM: NUMBER OF ATOMS, BOX BOUNDS and ATOMS"),
         (("pp pp pp", "pp pp ff"), "its cell is periodic along a, b only"),
     ],

@@ -39,6 +39,8 @@ GUESSED = ("atomic", "charge", "molecular", "full")
 #: Names of columns in a comment after Atoms.
 COLUMN = {"atom-id": "id", "mol-id": "mol", "molecule-id": "mol", "molecule": "mol", "atom-type": "type", "charge": "q"}
 UNITS = re.compile(r"units\s*=?\s*(real|metal|si|cgs|electron)\b")
+#: Columns with labels of types in a dump.
+LABELS = ("typelabel", "label")
 #: Columns of coordinates in a dump: wrapped, unwrapped, and both in units of the edges.
 COORDINATES = (("x", "y", "z"), ("xs", "ys", "zs"), ("xu", "yu", "zu"), ("xsu", "ysu", "zsu"))
 
@@ -261,22 +263,37 @@ def _dump_frame(path: Path, lines: list[str], first: int, units: str, atom_types
         notes = [f"its cell is periodic along {axes} only and is not used"] if axes else []
         cell = None
     masses = of("mass")[:, 0] if "mass" in columns else None
-    named = texts("element") if "element" in columns else []
-    elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
-    types = texts("type") if "type" in columns else named or [""] * count
-    if not elements and masses is not None:
-        element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
-        elements = [element[mass] for mass in masses.tolist()]
-    if not elements and atom_types is None and all(parse_whole_number(kind) is not None for kind in types):
-        hint = 'name the types by structure.atom_types, { 1 = "O" }'
-        raise structure_error(path, f"has only types of atoms, no elements or masses: {hint}")
+    columns_of_names = {name: texts(name) for name in ("type", "element", *LABELS) if name in columns}
+    names, elements = _dump_names(path, first + atoms + 1, columns_of_names, masses, atom_types)
     found = Atoms(
-        named if named and atom_types is None else _names(path, types, [], {}, atom_types),
-        elements if elements and atom_types is None else [""] * count,
-        _residues(texts("mol") if "mol" in columns else []) or [()] * count, position, None, cell, masses, notes,
+        names, elements, _residues(texts("mol") if "mol" in columns else []) or [()] * count, position, None, cell,
+        masses, notes,
     )  # fmt: skip
     velocity = of("vx", "vy", "vz") if {"vx", "vy", "vz"} <= set(columns) else None
     return _in_our_units(found, velocity, f"units {units}", "it does not name its units (dump_modify units yes)")
+
+
+def _dump_names(
+    path: Path, line: int, columns: dict[str, list[str]], masses: np.ndarray | None, atom_types: dict[str, str] | None
+) -> tuple[list[str], list[str]]:
+    """Names and elements of the atoms of a dump, from its columns of types, labels and elements, named in a line."""
+    named = columns.get("element", [])
+    labelled = next((columns[name] for name in LABELS if name in columns), named)
+    types = columns.get("type", labelled)
+    if not types and masses is None:
+        wanted = f"type, {', '.join(LABELS)}, element or mass"
+        raise structure_error(path, f"line {line}: has no column that names its atoms: {wanted}")
+    if atom_types is not None:
+        return _names(path, types, [], dict(zip(types, labelled, strict=False)), atom_types), [""] * len(types)
+    elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
+    if not elements and masses is not None:
+        element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}
+        elements = [element[mass] for mass in masses.tolist()]
+    names = labelled or types or [""] * len(elements)
+    if not elements and all(parse_whole_number(name) is not None for name in names):
+        hint = 'name the types by structure.atom_types, { 1 = "O" }'
+        raise structure_error(path, f"has only types of atoms, no elements or masses: {hint}")
+    return names, elements or [""] * len(names)
 
 
 def dump_box(path: Path, kinds: list[str], rows: list[tuple[int, list[str]]]) -> tuple[np.ndarray, np.ndarray]:
