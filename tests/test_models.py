@@ -490,7 +490,10 @@ def test_faults_of_tables_in_a_scene(change, expected, own, capsys):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (('name = "H"', 'name = "F"'), "atom H: no entry of sites or of parameters has this name or the name H"),
+        (
+            ('name = "H"', 'name = "F"'),
+            "atom H: no entry of sites or of parameters has this name or the name H; there are ",
+        ),
         (('name = "N"', 'name = "H"'), "sites: H appears twice"),
         (("sigma_A = 2.42\n", ""), "needs both sigma_A and one of epsilon_kJ_mol, epsilon_kcal_mol, epsilon_K"),
         (("epsilon_kcal_mol = 0.03", "epsilon_kcal_mol = 0.03\nepsilon_K = 15.0"), "not both"),

@@ -329,7 +329,8 @@ def test_a_format_too_narrow_for_a_long_way_is_told(tmp_path):
     state.velocity[:] = [[-1e6, 0, 0], [1e6, 0, 0]]
     simulation.start_from(state)
     with pytest.raises(
-        SimulationError, match=r"beyond the -999.99 Å that .pdb can hold: use .nc or .trr or .xyz, output.pos"
+        SimulationError,
+        match=r"beyond the -999.99 Å that .pdb .output.trajectory. can hold: use .nc or .trr or .xyz, output.pos",
     ):
         simulation.run()
 

@@ -1039,14 +1039,22 @@ def test_velocities_of_some_atoms(tmp_path):
         build(Scene.from_dict(data, tmp_path))
 
 
-def test_velocities_in_a_column_without_units_are_not_used(tmp_path):
+@pytest.mark.parametrize("column", ["vel", "velo", "velocity", "velocities"])
+def test_velocities_in_a_column_without_units_are_not_used(column, tmp_path):
     truth = Truth(["argon"] * 2)
     text = xyz(truth.atoms(), truth.cell).splitlines()
-    text[1] += " Properties=species:S:1:pos:R:3:vel:R:3"
+    text[1] += f" Properties=species:S:1:pos:R:3:{column}:R:3"
     text[2:] = [line + " 1 2 3" for line in text[2:]]
     found = read(tmp_path, "\n".join(text) + "\n", "a.xyz", ["argon"])
     assert found.velocity is None
-    assert found.notes == ("the column vel has no units and is not used (ASE writes momenta instead)",)
+    note = f"its velocities in the column {column} have no units and are not used (ASE writes momenta instead)"
+    assert found.notes == (note,)
+    data = {"structure": {"file": "a.xyz", "velocities": True}, "molecules": [{"model": "argon"}],
+            "forces": {"cutoff_A": 5.0}, "stages": [{"duration_ps": 1.0}]}  # fmt: skip
+    with pytest.raises(
+        StructureError, match=rf"no velocities of all atoms; its velocities in the column {column} have no"
+    ):
+        build(Scene.from_dict(data, tmp_path))
 
 
 def frames_of(ending, truths):
@@ -1569,6 +1577,8 @@ def test_lammps_dumps(columns, tilts, tmp_path):
 @pytest.mark.parametrize("columns", ["id typelabel x y z", "id type typelabel x y z", "id label x y z"])
 def test_labels_of_a_dump_are_named_by_atom_types(columns, tmp_path):
     text = dump_of(WATER_DATA, columns).replace(" OW ", " water_O ").replace(" HW ", " +h ")
+    with pytest.raises(StructureError, match=r"has atoms named .h, water_O, .* structure.atom_types gives them names"):
+        read(tmp_path, text, "a.dump")
     found = read(tmp_path, text, "a.dump", atom_types={"water_O": "O", "+h": "H"})
     same_molecules(found, WATER_DATA, [SPECIES["spce"]], 1e-6)
 

@@ -13,11 +13,13 @@ from scenes import FORTY_WATERS, NVT, forty_waters
 from support import (
     Frame,
     build,
+    export,
     formats,
     from_files,
     in_memory,
     load_model,
     open_trajectory,
+    random_rotations,
     read_atoms,
     read_frames,
     read_geometry,
@@ -30,7 +32,7 @@ from support import (
 )
 
 from rigidmd.commands import cli
-from rigidmd.errors import SceneError, StructureError
+from rigidmd.errors import SceneError, SimulationError, StructureError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 
@@ -259,6 +261,138 @@ def test_damaged_gsd_as_structure(tmp_path):
         except StructureError:
             refused += 1
     assert refused > 20
+
+
+def hoomd_frame(sites, *, names=None, centres=False, masses=None, cell=(20.0, 20.0, 20.0), whole=True):
+    """A frame as HOOMD writes them: waters of types A and B, wrapped, with or without central particles and images.
+
+    sites (n, 3, 3), names : of types. masses : of oxygen, hydrogen and of central particles
+    """
+    import gsd.hoomd
+
+    n = len(sites)
+    frame = gsd.hoomd.Frame()
+    position = np.concatenate([*([sites.mean(axis=1)] if centres else []), sites.reshape(-1, 3)])
+    frame.configuration.box = [*cell, 0, 0, 0]
+    frame.particles.N = len(position)
+    frame.particles.types = [*(names or ("A", "B")), "centre"]
+    frame.particles.typeid = [*([2] * n if centres else []), *([0, 1, 1] * n)]
+    first = np.repeat(np.arange(n), 3) if centres else np.repeat(np.arange(0, 3 * n, 3), 3)
+    frame.particles.body = np.concatenate([np.arange(n) if centres else [], first])
+    if centres:
+        frame.particles.moment_inertia = np.array([[1.0, 2.0, 3.0]] * n + [[0.0] * 3] * (3 * n))
+    if masses:
+        oxygen, hydrogen, whole_mass = masses
+        frame.particles.mass = [*([whole_mass] * n if centres else []), *([oxygen, hydrogen, hydrogen] * n)]
+    images = np.floor(position / cell)
+    frame.particles.position = position - (images + 0.5) * cell
+    if whole:
+        frame.particles.image = images.astype(int)
+    return frame
+
+
+@pytest.mark.parametrize("centres", [True, False])
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("named_by", ["types", "atom_types", "masses"])
+def test_molecules_of_hoomd(centres, whole, named_by, tmp_path):
+    """With and without central particles; types by name, by the scene, or by masses that add up."""
+    import gsd.hoomd
+
+    species = load_model("spce")
+    rng = np.random.default_rng(8)
+    truth = rng.uniform(0, 20, (6, 1, 3)) + 0.0
+    rotations = random_rotations(rng, 6)
+    sites = truth + np.einsum("nij,sj->nsi", rotations, species.positions_body)
+    mass, path = float(species.mass), tmp_path / "a.gsd"
+    frame = hoomd_frame(
+        sites, names=("OW", "HW") if named_by == "types" else None, centres=centres, whole=whole,
+        masses=(15.9994, 1.008, mass) if named_by == "masses" else (1.0, 1.0, mass),
+    )  # fmt: skip
+    with gsd.hoomd.open(path, "w") as file:
+        file.append(frame)
+    atom_types = {"A": "O", "B": "H"} if named_by == "atom_types" else None
+    found = read_structure(path, [species], None, True, 0.15, atom_types=atom_types)
+    assert found.residual_max < 1e-4
+    step = (found.position - truth[:, 0]) / 20
+    assert step == pytest.approx(np.round(step), abs=1e-5)
+    if named_by == "atom_types":
+        by_shape = read_structure(path, [species], None, True, 0.15)
+        assert by_shape.notes == ("the names of atoms A, B, B are not elements: assigned to spce by shape",)
+        with pytest.raises(StructureError, match=r"structure.atom_types has no name for type B"):
+            read_structure(path, [species], None, True, 0.15, atom_types={"A": "O"})
+
+
+def test_bodies_of_two_sites_alone(tmp_path):
+    """N2 as two particles of one body: neither is a central particle."""
+    import gsd.hoomd
+
+    frame = gsd.hoomd.Frame()
+    frame.configuration.box = [20, 20, 20, 0, 0, 0]
+    frame.particles.N, frame.particles.types, frame.particles.body = 4, ["N"], [0, 0, 2, 2]
+    at = np.array([[0, 0, 0.545], [0, 0, -0.545], [5, 5.545, 5], [5, 4.455, 5]])
+    frame.particles.position = at
+    frame.particles.velocity = [[1, 0, 0], [-1, 0, 0], [2, 0, 1], [2, 0, 1]]
+    with gsd.hoomd.open(tmp_path / "a.gsd", "w") as file:
+        file.append(frame)
+    found = read_structure(tmp_path / "a.gsd", [load_model("nitrogen")], None, True, 0.15)
+    assert found.position == pytest.approx(10 + np.array([[0, 0, 0], [5, 5, 5]]), abs=1e-5)
+    assert found.velocity == pytest.approx(np.array([[0, 0, 0], [2, 0, 1]]), abs=1e-6)
+    spin = np.linalg.norm(found.angular_momentum_body, axis=1)
+    assert spin == pytest.approx([2 * 14.0067 * 0.545, 0.0], rel=1e-2, abs=1e-5)
+
+
+@pytest.mark.parametrize("ending", EVERY_ENDING)
+def test_sites_without_elements_are_read_from_all_trajectories(ending, tmp_path):
+    """Two heavy sites of one mass, and massless charges."""
+    system = build(small_scene({"co2_2cljq": 5}, 30.0))
+    path = tmp_path / f"old{ending}"
+    file = open_trajectory(path, system, 1.0, False, False)
+    file.write(system.state, 0.0, 0)
+    file.close()
+    write_topology(tmp_path / "topology.gro", system, system.state, wrapped=False)
+    needs_names = ending in (".xtc", ".trr", ".dcd", ".nc")
+    topology = tmp_path / "topology.gro" if needs_names else None
+    found = read_structure(path, system.species, None, True, 0.15, topology=topology)
+    assert np.abs(found.position - system.state.position).max() < 0.01
+    assert read_frames(path, len(system.sites.mass), 10).positions[0] == pytest.approx(
+        system.site_positions(system.state, False), abs=0.01
+    )
+    if ending == ".xyz":  # other programs read it with elements, X for none
+        assert ase.io.read(path).get_chemical_symbols() == ["X"] * len(system.sites.mass)
+
+
+def test_the_data_file_of_an_export_is_read_back_with_its_velocities(tmp_path):
+    """Its name must not count as the name of units."""
+    scene = small_scene({"tip4p2005": 8}, 20.0, name="unitsmetal")
+    system = build(scene)
+    export(scene, "lammps", tmp_path / "out", False)
+    path = tmp_path / "out" / "data.lammps"
+    found = read_structure(path, system.species, None, True, 0.15)
+    step = (found.position - system.state.position) / 20
+    assert step == pytest.approx(np.round(step), abs=1e-9)
+    assert found.velocity == pytest.approx(system.state.velocity, abs=1e-9)
+    there = np.linalg.norm(system.state.angular_momentum_body, axis=1)
+    assert np.linalg.norm(found.angular_momentum_body, axis=1) == pytest.approx(there, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "others"),
+    [
+        ("topology.gro", 2e5, "set output.positions"),
+        ("topology.pdb", 2e4, "use .gro, output.positions"),
+        ("topology.pdb", 2e5, "set output.positions"),
+    ],
+)
+def test_a_topology_that_cannot_hold_positions_names_its_own_key(name, at, others, tmp_path):
+    system = build(small_scene({"argon": 2}, 20.0))
+    state = system.state.copy()
+    state.position[:] += at
+    limit = {"gro": "99999.9", "pdb": "9999.99"}[name[-3:]]
+    with pytest.raises(
+        SimulationError, match=rf"beyond the {limit} Å that .{name[-3:]} .output.topology. can hold: {others}"
+    ):
+        write_topology(tmp_path / name, system, state, wrapped=False)
+    write_topology(tmp_path / name, system, state, wrapped=True)
 
 
 def test_a_trajectory_is_no_molecule(tmp_path):

@@ -19,7 +19,7 @@ from rigidmd.assemble.assignment import (
     massive_sites,
     numbered,
 )
-from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of
+from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of, is_element
 from rigidmd.io.formats.bonds import shortest_links
 from rigidmd.io.formats.cells import make_whole, pairs_within
 from rigidmd.scene.models import Molecule
@@ -31,6 +31,7 @@ NO_MASS = 0.1
 #: Up to this multiple of the tolerance the best order of atoms is searched, for messages on molecules that do not fit.
 SEARCH_TOLERANCE = 3
 MOST_SEARCHED = 5  # of these molecules
+UNKNOWN = "X?"  # the kind of an atom with mass that is one of several sites without elements
 MOST_LISTED = 6  # atoms of a molecule in a message
 #: If two species fit, the better one is taken if its rms deviation is less than this fraction of the other's: as models
 #: of water that differ, a .gro has 0.004 and 0.05 Å.
@@ -124,12 +125,19 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
         """The isotope of hydrogen in the scene, for others in the file: light water from a file of heavy water."""
         return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
 
+    def without_element(mass: float) -> str:
+        """The site of this mass that has no element, such as a united atom; X, without mass, if there is none."""
+        near = {label for other, label in by_mass if abs(other - mass) <= SAME_MASS * mass and not is_element(label)}
+        return near.pop() if len(near) == 1 else UNKNOWN if near else "X"
+
     @cache
     def kind(name: str, element: str, mass: float, residue: str | None) -> str:
         if 0 < mass < NO_MASS:
             return "X"
         if mass > 0:
-            if name == "X" or isotope(name) in vocabulary:
+            if name == "X":
+                return without_element(mass)
+            if isotope(name) in vocabulary:
                 return isotope(name)
             if name in site_names:
                 return by_name[name]
@@ -138,8 +146,11 @@ def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
                 return label
             if (guess := isotope(element_of(name, vocabulary))) in vocabulary:
                 return guess
-        if name in site_names and (not element or element == "X"):
-            return by_name[name]
+        if not element or element == "X":
+            if name in site_names:
+                return by_name[name]
+            if name in vocabulary:
+                return name
         if name == virtual:
             return "X"
         if element:
@@ -176,6 +187,11 @@ def _bonded(
         for i, j in shortest_links(points):
             one, other, length = number[i], number[j], float(np.linalg.norm(points[i] - points[j]))
             reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
+    if UNKNOWN in numbers:
+        sites = [number for kind, number in numbers.items() if kind != UNKNOWN and not is_element(kind)]
+        longest = reach[np.ix_(sites, sites)].max(initial=0.0)
+        reach[numbers[UNKNOWN], [*sites, numbers[UNKNOWN]]] = longest
+        reach[[*sites, numbers[UNKNOWN]], numbers[UNKNOWN]] = longest
     with_mass = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
     number = np.array([numbers[kinds[i]] for i in with_mass], int)
     i, j, step = pairs_within(atoms.position[with_mass], cell, reach.max())

@@ -21,6 +21,9 @@ from rigidmd.scene.species import Molecules, spans
 from rigidmd.scene.validation import ValidationError, not_none, validation_messages
 
 
+MOST_LISTED = 8  # entries of parameters in a message
+
+
 def species_of(scene: MolecularScene) -> list[Molecule]:
     """The species of a scene, in its order. Raises SceneError with all errors."""
     found, faults = [], []
@@ -60,10 +63,13 @@ def sites_of_geometry(path: Path, given: tuple[Site, ...], table: tuple[Site, ..
     """Sites with positions from a file and parameters from given entries or a table, by atom name or else by element.
     `where` names the entries in messages. Raises StructureError with all errors."""
     faults, sites, used = [], [], set()
+    available = list(dict.fromkeys(site.name for site in (*given, *table))) or ["none"]
+    listed = ", ".join(available[:MOST_LISTED]) + (", ..." if len(available) > MOST_LISTED else "")
+    hint = f"there are {listed}. The atoms of the file may have these names in place of elements"
     for name, element, mass, position in zip(*read_geometry(path), strict=True):
         match, shared = find_site(given, name, element), find_site(table, name, element)
         if match is None and shared is None:
-            faults.append(f"atom {name}: no entry of {where} has this name or the name {element}")
+            faults.append(f"atom {name}: no entry of {where} has this name or the name {element}; {hint}")
             continue
         used.add(match.name if match else "")
         entries = [s for s in (match, shared) if s is not None]

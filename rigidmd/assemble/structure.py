@@ -20,6 +20,7 @@ from rigidmd.io.formats.cells import (
     basis_of, cell_error, describe_basis, describe_cell, least_skewed_cell, reduced_cell, right_angled, same_lattice,
     standard_rotation,
 )  # fmt: skip
+from rigidmd.io.formats import has_types
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
@@ -152,6 +153,8 @@ def _read_molecules(
     matched = match(atoms, species, atoms.cell if atoms.cell is not None or not periodic else wanted, tolerance)
     if isinstance(matched, list):
         more = [f"and {len(matched) - MOST_NAMED} more"] if len(matched) > MOST_NAMED else []
+        if atom_types is None and has_types(path) and matched[0].startswith("has atoms named"):
+            matched[0] += ". If these are types, structure.atom_types gives them names"
         faults = _unknown_masses(atoms, species) + matched[:MOST_NAMED] + more + _other_units(atoms, species)
         faults += [f"as read: {note}" for note in atoms.notes]
         raise StructureError(str(path), faults)

@@ -15,7 +15,7 @@ import numpy as np
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
-from rigidmd.io.formats import BY_CONTENT, TOPOLOGIES, Format, format_of
+from rigidmd.io.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
 from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
 from rigidmd.io.formats.through_ase import from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import index_of, read_in_process
@@ -86,9 +86,9 @@ def _without_placeholder(atoms: Atoms) -> Atoms:
 def _read_trajectory(path: Path, form: Format, frame: int, atom_types, topology: Path | None) -> Atoms:
     """The atoms of a frame, with the names in the topology file if the format has none."""
     if form.read_arrays is None:
-        if atom_types is not None:
+        if atom_types is not None and not form.has_types:
             raise structure_error(path, _no_types())
-        return not_none(form.read_frame)(path, frame)
+        return not_none(form.read_frame)(path, frame, *([atom_types] if form.has_types else []))
     if topology is None:
         missing = f"there is no {' or '.join(TOPOLOGIES)} next to it"
         raise structure_error(path, f"holds no names of atoms, and {missing}: name a file by structure.topology")
@@ -98,7 +98,8 @@ def _read_trajectory(path: Path, form: Format, frame: int, atom_types, topology:
 
 
 def _no_types() -> str:
-    names = [form.name or " ".join(form.extensions) for form in BY_CONTENT if form.has_types]
+    forms = dict.fromkeys((*BY_CONTENT, *BY_EXTENSION.values()))
+    names = [form.name or " ".join(form.extensions) for form in forms if form.has_types]
     return f"structure.atom_types is for formats whose atoms have types: {', '.join(names)}"
 
 

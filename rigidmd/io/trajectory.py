@@ -38,6 +38,10 @@ EVEN = 1e-6
 T = TypeVar("T")
 
 
+#: Formats of trajectories that hold any positions at any times.
+UNLIMITED = written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even)
+
+
 def universe(system: System | BodySystem, state: State, wrapped: bool = True) -> mda.Universe:
     """An MDAnalysis Universe of all sites, one residue per molecule, with one frame of this state."""
     u = universe_of(system)
@@ -332,17 +336,20 @@ def open_trajectory(
 
 def write_topology(path: Path, system: System | BodySystem, state: State, wrapped: bool) -> None:
     """Write names, molecules and first positions for viewers. Raises SimulationError if the format cannot hold one."""
-    _check_fits(path, system.site_positions(state, wrapped))
+    positions = system.site_positions(state, wrapped)
+    others = written(lambda form: form.write_topology and form.exceeded(positions) is None)
+    _check_fits(path, positions, "output.topology", others)
     with atomic_file(path) as temporary, ignore_warnings():  # of missing attributes (occupancies, ...)
         write = not_none(BY_EXTENSION[path.suffix].write_topology)
         write(temporary, universe(system, state, wrapped).select_atoms("all"))
 
 
-def _check_fits(path: Path, positions: np.ndarray) -> None:
+def _check_fits(path: Path, positions: np.ndarray, key: str, others: Sequence[str]) -> None:
+    """Raise SimulationError if the format of a file cannot hold positions (s, 3); `others` are formats that can."""
     if (bound := BY_EXTENSION[path.suffix].exceeded(positions)) is not None:
-        others = " or ".join(written(lambda form: form.encoder and form.limits == (-inf, inf) and not form.even))
-        hint = f"use {others}, output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
-        raise SimulationError(f"a position is beyond the {bound:g} Å that {path.suffix} can hold: {hint}")
+        hint = "output.positions = 'wrapped', or for a body a smaller output.trajectory_A_per_m"
+        hint = f"use {' or '.join(others)}, {hint}" if others else f"set {hint}"
+        raise SimulationError(f"a position is beyond the {bound:g} Å that {path.suffix} ({key}) can hold: {hint}")
 
 
 class TrajectoryFile(AppendedFile):
@@ -376,7 +383,7 @@ class TrajectoryFile(AppendedFile):
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
         positions = self._system.site_positions(state, self._wrapped)
-        _check_fits(self._path, positions.astype(np.float32))
+        _check_fits(self._path, positions.astype(np.float32), "output.trajectory", UNLIMITED)
         velocities = self._system.site_velocities(state) if self._velocities else None
         cell = state.cell if np.isfinite(state.cell).all() else None
         with writing(self._path):  # memory for the file of a frame may be insufficient

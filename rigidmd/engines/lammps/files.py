@@ -91,7 +91,8 @@ def write_data(path: Path, view: ForceFieldView, state: State) -> None:
     system = view.system
     position, velocity = system.site_positions(state), system.site_velocities(state)
     image = np.zeros(position.shape, int)
-    lines = [f"{system.scene.name}, written by rigidmd", ""]
+    # the first line may name the units of velocities for readers; those of LAMMPS are chosen by its script
+    lines = [f"LAMMPS data file, units = real, of {system.scene.name}, written by rigidmd", ""]
     lines += [f"{len(position)} atoms", f"{len(view.kinds)} atom types", ""]
     low, high, tilt = position.min(axis=0) - 1, position.max(axis=0) + 1, ()
     if view.is_periodic:

@@ -34,9 +34,10 @@ class Format(NamedTuple):
     read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
     content: re.Pattern[str] | None = None  # recognises the begin of a text whose extension is unknown
     has_types: bool = False
-    # A frame of a trajectory, 1 for the first, -1 for the last. If the format has no names, `read_arrays` returns the
-    # position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a damaged file may crash it.
-    read_frame: Callable[[Path, int], Atoms] | None = None
+    # A frame of a trajectory, 1 for the first, -1 for the last; with `has_types` as `read`. If the format has no names,
+    # `read_arrays` returns the position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a
+    # damaged file may crash it.
+    read_frame: Callable[..., Atoms] | None = None  # (path, frame)
     read_arrays: Callable[[str, int, int], dict[str, np.ndarray]] | None = None  # (path, frame, number of atoms)
 
     # As a trajectory. A format is written by `encoder`: (system, interval ps, whether with velocities) -> function of a
@@ -95,6 +96,12 @@ def find_modules() -> None:
 def format_of(path: str | Path) -> Format | None:
     """The format of a file by its extension; None for one that only ASE may know, or nobody."""
     return BY_EXTENSION.get(Path(path).suffix.lower())
+
+
+def has_types(path: str | Path) -> bool:
+    """Whether atoms in a file of this name have types, which structure.atom_types may name."""
+    form = format_of(path)
+    return form is None or form.has_types
 
 
 def extensions(wanted: Callable[[Format], Any]) -> tuple[str, ...]:

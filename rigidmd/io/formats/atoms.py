@@ -65,6 +65,27 @@ def element_of_mass(mass: float) -> str:
     return nearest if abs(known[nearest] - mass) <= SAME_MASS * mass else ""
 
 
+def names_of_types(
+    path: Path, types: list[str], listed: list[str], names: dict[str, str], atom_types: dict[str, str] | None
+) -> list[str]:
+    """The name of each atom of these types: by structure.atom_types, else by the file, else the type itself.
+
+    listed : all types of the file. names : of types, in the file. Raises StructureError.
+    """
+    if atom_types is None:
+        return [names.get(kind, kind) for kind in types]
+    present = sorted({*types, *listed}, key=lambda kind: (parse_whole_number(kind) or 0, kind))
+    given = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
+    errors = []
+    if unknown := [key for key in atom_types if key not in given.values()]:
+        errors.append(f"structure.atom_types: unknown type {', '.join(unknown)}; there are {', '.join(present)}")
+    if unnamed := [kind for kind, key in given.items() if key is None]:
+        errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
+    if errors:
+        raise StructureError(str(path), errors)
+    return [atom_types[given[kind]] for kind in types]
+
+
 class Frame(NamedTuple):
     """A frame of a trajectory. If a run writes a file, it keeps only the times of frames in memory."""
 

@@ -18,12 +18,15 @@ import numpy as np
 
 from rigidmd.core.state import State
 from rigidmd.io.formats import Format, System, register
-from rigidmd.io.formats.atoms import Atoms, Frame, structure_error
+from rigidmd.io.formats.atoms import SAME_MASS, Atoms, Frame, names_of_types, structure_error
 from rigidmd.io.formats.bonds import charges, connections
+from rigidmd.io.formats.cells import make_whole
 from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.io.formats.through_mdanalysis import index_of
 from rigidmd.mechanics.rotation import from_quaternion, to_quaternion
 
+#: Distance, Å, between particles at one position.
+COINCIDENT = 1e-3
 #: Logged quantity with the time of a frame, ps, which the schema lacks.
 TIME = "time_ps"
 
@@ -35,7 +38,8 @@ class Particles(NamedTuple):
     time: float  # ps; NaN if the file does not have it
     cell: np.ndarray | None  # (3, 3) rows a, b, c
     label: list[str]  # (N,) names of types
-    owner: np.ndarray  # (N,) index of the central particle of the body; of the particle itself without a body
+    body: np.ndarray  # (N,) number of the body; of the particle itself without a body
+    owner: np.ndarray  # (N,) index of the central particle of the body; of the particle itself without one
     position: np.ndarray  # (N, 3) lab frame, molecules whole
     orientation: np.ndarray  # (N, 4) wxyz, normalised
     velocity: np.ndarray | None  # (N, 3)
@@ -44,15 +48,25 @@ class Particles(NamedTuple):
     mass: np.ndarray  # (N,)
 
     @property
+    def site_masses(self) -> np.ndarray | None:
+        """Masses of the sites (s,), if those of each body add up to the mass of its central particle: HOOMD does not
+        use masses of constituents, which may have any value."""
+        sites, body = self.sites, self.owner[self.sites]
+        total = np.bincount(body, self.mass[sites], len(self.owner))
+        centres = np.unique(body)
+        agrees = np.abs(total[centres] - self.mass[centres]) <= SAME_MASS * self.mass[centres]
+        return self.mass[sites] if agrees.all() and np.ptp(self.mass[sites]) > 0 else None
+
+    @property
     def centres(self) -> np.ndarray:
-        """Indices of central particles and particles without a body: one for each molecule."""
+        """Indices of central particles and particles without one."""
         return np.flatnonzero(self.owner == np.arange(len(self.owner)))
 
     @property
     def sites(self) -> np.ndarray:
         """Indices of all particles except the central ones of bodies, molecule by molecule."""
         size = np.bincount(self.owner, minlength=len(self.owner))
-        order = np.argsort(self.owner, kind="stable")
+        order = np.argsort(self.body, kind="stable")
         return order[(self.owner[order] != order) | (size[order] == 1)]
 
     def rotation(self) -> np.ndarray:
@@ -106,6 +120,7 @@ class GsdReader:
         body = of("body", (), -1).astype(np.int32).astype(int)  # -1 is often stored unsigned
         if body.max() >= n:
             raise ValueError(f"frame {frame + 1} has a particle of a body that does not exist")
+        body = np.where(body < 0, np.arange(n), body)
         position, box, cell = position.astype(float), self._chunk(frame, "configuration/box"), None
         if box is not None and box.any():
             if box.shape != (6,):
@@ -113,20 +128,23 @@ class GsdReader:
             lx, ly, lz, xy, xz, yz = box.astype(float)
             cell = np.array([[lx, 0, 0], [xy * ly, ly, 0], [xz * lz, yz * lz, lz]])
             position += (of("image", (3,), 0) + 0.5) @ cell
+            if self._chunk(frame, "particles/image") is None:
+                position = _whole_bodies(position, body, cell)
         orientation = of("orientation", (4,), (1, 0, 0, 0)).astype(float)
         length = np.linalg.norm(orientation, axis=1, keepdims=True)
         if not (length > 0).all():
             raise ValueError(f"frame {frame + 1} has an orientation of length 0")
         orientation /= length
         step, time = self._chunk(frame, "configuration/step"), self._chunk(frame, f"log/{TIME}")
+        inertia = of("moment_inertia", (3,), 0).astype(float)
         moving = self._chunk(frame, "particles/velocity") is not None
         return Particles(
             step=0 if step is None else int(step.flat[0]),
             time=nan if time is None or time.size != 1 else float(time.flat[0]), cell=cell,
-            label=[types[k] for k in kind], owner=np.where(body < 0, np.arange(n), body), position=position,
+            label=[types[k] for k in kind], body=body, owner=_owners(body, position, inertia), position=position,
             orientation=orientation, velocity=of("velocity", (3,), 0).astype(float) if moving else None,
             angular_momentum_body=_vector_part(orientation, of("angmom", (4,), 0).astype(float)),
-            inertia=of("moment_inertia", (3,), 0).astype(float), mass=of("mass", (), 1).astype(float),
+            inertia=inertia, mass=of("mass", (), 1).astype(float),
         )  # fmt: skip
 
     def frame(self, k: int) -> Frame:
@@ -155,6 +173,27 @@ class GsdReader:
         if found.shape != (n, *width):
             raise ValueError(f"frame {frame + 1}: particles/{name} is of {found.shape}, must be {(n, *width)}")
         return found
+
+
+def _owners(body: np.ndarray, position: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """The central particle (N,) of each particle, itself without one. A body has one if the particle of its number has
+    moments of inertia, or is where one of the others is, which then has all mass; else it consists of sites alone."""
+    index = np.arange(len(body))
+    others = index[body != index]
+    nearest = np.full(len(body), np.inf)
+    np.minimum.at(nearest, body[others], np.linalg.norm(position[others] - position[body[others]], axis=1))
+    is_central = np.isfinite(nearest) & (inertia.any(axis=1) | (nearest <= COINCIDENT))
+    return np.where(is_central[body], body, index)
+
+
+def _whole_bodies(position: np.ndarray, body: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Positions (N, 3) of a file without image numbers, in which the particles of each body are near each other."""
+    position, size = position.copy(), np.bincount(body, minlength=len(body))
+    order = np.argsort(body, kind="stable")
+    for count in np.unique(size[size > 1]):
+        members = order[size[body[order]] == count].reshape(-1, count)
+        position[members] = make_whole(position[members], cell, np.zeros((count, count)))
+    return position
 
 
 def box_of(cell: np.ndarray) -> list[float]:
@@ -298,21 +337,25 @@ def _labels(system: System) -> np.ndarray:
     return system.of_sites(labels)
 
 
-def read_frame(path: Path, frame: int) -> Atoms:
+def read_frame(path: Path, frame: int, atom_types: dict[str, str] | None = None) -> Atoms:
     try:
         with contextlib.closing(GsdReader(path)) as reader:
             found = reader.read(index_of(reader.count, frame))
     except (OSError, ValueError) as error:
         raise structure_error(path, f"cannot be read as a trajectory: {error}") from None
     sites = found.sites
-    names = [found.label[site].rsplit(".", 1)[-1] for site in sites]  # a type may be species.name
+    types = [found.label[site] for site in sites]
+    names = {label: label.rsplit(".", 1)[-1] for label in types}  # a type may be species.name
+    # a body is named by the type of its central particle
+    is_named = np.isin(np.arange(len(found.body)), found.body[sites][found.owner[sites] == found.body[sites]])
+    residue = [(int(body) + 1, found.label[body] if is_named[body] else "") for body in found.body[sites]]
     return Atoms(
-        names, [""] * len(names), [(int(owner) + 1, found.label[owner]) for owner in found.owner[sites]],
-        found.position[sites], found.site_velocities(), found.cell,
+        names_of_types(path, types, [], names, atom_types), [""] * len(types), residue, found.position[sites],
+        found.site_velocities(), found.cell, found.site_masses if atom_types is None else None,
     )  # fmt: skip
 
 
 register(Format(
-    (".gsd",), read_frame=read_frame, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
+    (".gsd",), read_frame=read_frame, has_types=True, writer=GsdFile, reader=GsdReader, velocities=True, rotations=True,
     viewer="ovito {trajectory}",
 ))  # fmt: skip

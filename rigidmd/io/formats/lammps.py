@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
-from rigidmd.errors import StructureError
 from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import (
-    HEAVY_HYDROGEN, Atoms, atom_count, element_of_mass, is_element, numbers, structure_error, table, unexpected,
+    HEAVY_HYDROGEN, Atoms, atom_count, element_of_mass, is_element, names_of_types, numbers, structure_error, table,
+    unexpected,
 )  # fmt: skip
 from rigidmd.io.formats.through_ase import ASE_VELOCITY
 
@@ -108,7 +108,7 @@ def _data_atoms(path: Path, title: str, head, style: str, sections: dict[str, li
         raise structure_error(path, f"has no section Masses, and its atom types are unknown: {hint}")
     element = {kind: element_of_mass(mass) for kind, mass in mass_of.items()}
     found = Atoms(
-        _names(path, types, [*mass_of], names, atom_types), [element.get(kind, "") for kind in types],
+        names_of_types(path, types, [*mass_of], names, atom_types), [element.get(kind, "") for kind in types],
         _residues([row.words[column["mol"]] for row in rows] if "mol" in column else []) or [()] * len(rows), position,
         cell=cell, masses=masses,
     )  # fmt: skip
@@ -174,22 +174,6 @@ def _box(path: Path, head: list[Row]) -> np.ndarray | None:
     if "xy xz yz" in by_name:
         cell[1, 0], cell[2, 0], cell[2, 1] = numbers(path, *by_name["xy xz yz"], "three tilts of the box")
     return cell
-
-
-def _names(path: Path, types: list[str], listed: list[str], names: dict[str, str], atom_types) -> list[str]:
-    """The name of each atom: the scene's name of its type, else the file's, else the type. Raises StructureError."""
-    if atom_types is None:
-        return [names.get(kind, kind) for kind in types]
-    present = sorted({*types, *listed}, key=lambda kind: (parse_whole_number(kind) or 0, kind))
-    given = {kind: next((key for key in (kind, names.get(kind)) if key in atom_types), None) for kind in present}
-    errors = []
-    if unknown := [key for key in atom_types if key not in given.values()]:
-        errors.append(f"structure.atom_types: unknown type {', '.join(unknown)}; there are {', '.join(present)}")
-    if unnamed := [kind for kind, key in given.items() if key is None]:
-        errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
-    if errors:
-        raise StructureError(str(path), errors)
-    return [atom_types[given[kind]] for kind in types]
 
 
 def _residues(numbers_of: Iterable[str]) -> list[tuple]:
@@ -284,7 +268,7 @@ def _dump_names(
         wanted = f"type, {', '.join(LABELS)}, element or mass"
         raise structure_error(path, f"line {line}: has no column that names its atoms: {wanted}")
     if atom_types is not None:
-        return _names(path, types, [], dict(zip(types, labelled, strict=False)), atom_types), [""] * len(types)
+        return names_of_types(path, types, [], dict(zip(types, labelled, strict=False)), atom_types), [""] * len(types)
     elements = [e if is_element(e) or e in HEAVY_HYDROGEN else "" for e in named]
     if not elements and masses is not None:
         element = {mass: element_of_mass(mass) for mass in set(masses.tolist())}

@@ -71,7 +71,9 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
         bad = int(np.argmin(np.isfinite(velocity).all(axis=1)))
         raise structure_error(path, f"atom {bad + 1} has a velocity that is not a finite number")
     if unitless := [key for key in UNITLESS_VELOCITIES if key in atoms.arrays]:
-        notes.append(f"the column {unitless[0]} has no units and is not used (ASE writes momenta instead)")
+        notes.append(
+            f"its velocities in the column {unitless[0]} have no units and are not used (ASE writes momenta instead)"
+        )
     cell = None
     if atoms.pbc.all():
         cell = atoms.cell.array.copy()

@@ -89,6 +89,10 @@ def _columns(properties: str) -> tuple[int | None, int | None, int]:
 def encoder(system: System, interval: float, velocities: bool) -> Encode:
     """Extended XYZ, for OVITO and ASE: box and time are in the comment line."""
     files = FrameFiles(system, velocities, "XYZ")
+    # names of all sites, where elements do not name all that have mass
+    nameless = bool(((system.sites.element == "X") & (system.sites.mass > 0)).any())
+    names = [f" {name}\n".encode() for name in system.sites.name] if nameless else []
+    column = f":{NAMES}:S:1" if nameless else ""
 
     def encode(frame: Frame, k: int) -> bytes:
         box = 'pbc="F F F"'
@@ -96,10 +100,14 @@ def encoder(system: System, interval: float, velocities: bool) -> Encode:
             box = f'Lattice="{" ".join(f"{x:.9g}" for x in frame.cell.flat)}" pbc="T T T"'
 
         def write(writer, atoms):
-            writer.remark = f"{box} Properties=species:S:1:pos:R:3 Time={frame.time:.9g}"
+            writer.remark = f"{box} Properties=species:S:1:pos:R:3{column} Time={frame.time:.9g}"
             writer.write(atoms)
 
-        return files.content(frame, write).removesuffix(b"\n\n") + b"\n"
+        text = files.content(frame, write).removesuffix(b"\n\n") + b"\n"
+        if not names:
+            return text
+        head, rows = text.splitlines(keepends=True)[:2], text.splitlines()[2:]
+        return b"".join([*head, *(row + name for row, name in zip(rows, names, strict=True))])
 
     return encode
 
