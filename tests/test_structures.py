@@ -697,6 +697,29 @@ def test_the_box_of_a_scene_and_that_of_its_own_last_state_are_one(tmp_path):
     assert any("the scene's box: its lattice is given by" in note and "c' = c - a" in note for note in again.notes)
 
 
+@pytest.mark.parametrize(("numbers", "codes"), [((5, 5), "AB"), ((5, 5), " A"), ((7, 8), "  ")])
+def test_insertion_codes_separate_the_residues_of_a_pdb(numbers, codes, tmp_path):
+    """Two waters of one number, as of a hydrate: residues, not bonding distances, are the molecules."""
+    truth = Truth(["spce"] * 2, 5)
+    labels = [f"{number:4d}{code}" for number, code in zip(numbers, codes, strict=True)]
+    lines = pdb(truth.atoms(), cryst1(truth.cell), number=lambda k: f"{k:4d}").splitlines()
+    for k, label in enumerate(labels):
+        lines = [line[:22] + label + line[27:] if line[22:26] == f"{k:4d}" else line for line in lines]
+    found = read(tmp_path, "\n".join(lines), "a.pdb")
+    same_molecules(found, truth, [SPECIES["spce"]], 0.002)
+    assert found.notes == ()
+    assert found.number.tolist() == list(numbers)
+
+
+@pytest.mark.parametrize(("group", "is_reported"), [("P 1", False), ("P1", False), ("", False), ("P 21 21 21", True)])
+def test_the_space_group_of_a_pdb_is_reported(group, is_reported, tmp_path):
+    truth = Truth(["spce"] * 2, 5)
+    text = pdb(truth.atoms(), cryst1(truth.cell).removesuffix(" P 1") + f" {group:<11}{1:4d}")
+    found = read(tmp_path, text, "a.pdb")
+    note = "line 1: the space group P 21 21 21 is not applied: its atoms were taken as all atoms of the cell"
+    assert found.notes == ((note,) if is_reported else ())
+
+
 def test_a_pdb_that_is_cut_off_says_so(tmp_path):
     """Cut between two molecules it is a whole file of fewer, but for its end."""
     system = build(small_scene({"spce": 8}, 20.0))
@@ -1838,6 +1861,111 @@ def test_an_atom_of_any_name_in_the_residue_of_a_point(tmp_path):
     text = gro(rows, box_of(truth.cell), 6, residue_names={0: "W", 1: "W", 2: "W", 3: "AR"})
     found = read(tmp_path, text, "a.gro", [bead, "argon"])
     assert found.species.tolist() == [0, 0, 0, 1]
+
+
+# sites without mass or element, and names, in formats that ASE reads
+
+
+def as_gen(rows, cell) -> str:
+    kinds = list(dict.fromkeys(name for name, _ in rows))
+    lines = [f"{k} {kinds.index(name) + 1} {x} {y} {z}" for k, (name, (x, y, z)) in enumerate(rows, 1)]
+    edges = "\n".join(" ".join(map(str, edge)) for edge in cell)
+    return "\n".join([f"{len(rows)} S", " ".join(kinds), *lines, "0 0 0", edges, ""])
+
+
+def as_g96(rows, cell, velocity=None) -> str:
+    def block(name, vectors):
+        rows_of = [
+            f"{1:5d} MIX   {atom:<5}{k + 1:7d}{''.join(f'{v:15.9f}' for v in vector)}"
+            for k, ((atom, _), vector) in enumerate(zip(rows, vectors, strict=True))
+        ]
+        return "\n".join([name, *rows_of, "END"])
+
+    parts = ["TITLE\nwater\nEND", block("POSITION", [np.array(x) / 10 for _, x in rows])]
+    parts += [] if velocity is None else [block("VELOCITY", np.array(velocity) / 10)]
+    return "\n".join([*parts, f"BOX\n{''.join(f'{x:15.9f}' for x in np.diag(cell) / 10)}\nEND\n"])
+
+
+def as_dl_poly(rows, cell) -> str:
+    edges = "\n".join("".join(f"{x:20.10f}" for x in edge) for edge in cell)
+    atoms = "\n".join(f"{name:<8}{k:10d}\n{''.join(f'{x:20.10f}' for x in at)}" for k, (name, at) in enumerate(rows, 1))
+    return f"water\n         0         2\n{edges}\n{atoms}\n"
+
+
+def as_poscar(rows, cell) -> str:
+    edges = "\n".join(" ".join(map(str, edge)) for edge in cell)
+    names, counts = " ".join(name for name, _ in rows), " ".join("1" for _ in rows)
+    positions = "\n".join(" ".join(map(str, at)) for _, at in rows)
+    return f"water\n1.0\n{edges}\n{names}\n{counts}\nCartesian\n{positions}\n"
+
+
+def as_xsf(rows, cell) -> str:
+    edges = "\n".join(" ".join(map(str, edge)) for edge in cell)
+    atoms = "\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows)
+    return f"CRYSTAL\nPRIMVEC\n{edges}\nPRIMCOORD\n{len(rows)} 1\n{atoms}\n"
+
+
+FORMATS = {
+    "a.gen": as_gen,
+    "a.g96": as_g96,
+    "CONFIG": as_dl_poly,
+    "a.dlp4": as_dl_poly,
+    "a.vasp": as_poscar,
+    "a.xsf": as_xsf,
+}
+
+
+@pytest.mark.parametrize("massless", ["M", "MW", "EP", "Du", "Q", "L", "X", "IW"])
+@pytest.mark.parametrize("file", FORMATS)
+def test_massless_sites_in_formats_that_know_elements(file, massless, tmp_path):
+    truth = Truth(["tip4p2005"] * 3, 40)
+    names = {"OW": "O", "HW1": "H", "HW2": "H", "MW": massless}
+    text = FORMATS[file]([(names[name], tuple(x)) for name, _, _, x, _ in truth.atoms()], truth.cell)
+    same_molecules(read(tmp_path, text, file, ("tip4p2005",)), truth, [SPECIES["tip4p2005"]], 1e-4)
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_deuterium_in_formats_that_know_elements(file, tmp_path):
+    truth = Truth(["spce"] * 3, 41)
+    text = FORMATS[file]([(e.replace("H", "D"), tuple(x)) for _, e, _, x, _ in truth.atoms()], truth.cell)
+    same_molecules(read(tmp_path, text, file), truth, [SPECIES["spce"]], 1e-4)
+
+
+@pytest.mark.parametrize("file", ["a.g96", "CONFIG", "conf"])
+def test_ions_by_names_in_formats_of_force_fields(file, tmp_path):
+    """NA is no nitrogen, and CL no carbon."""
+    truth = Truth(["sodium", "chloride", "spce", "sodium"], 42)
+    rows = [(name.upper(), tuple(x)) for name, _, _, x, _ in truth.atoms()]
+    text = FORMATS.get(file, as_g96)(rows, truth.cell)
+    species = [SPECIES[name] for name in ("sodium", "chloride", "spce", "nitrogen")]
+    same_molecules(read(tmp_path, text, file, species), truth, species, 1e-4)
+
+
+def test_velocities_and_frames_of_g96(tmp_path):
+    truths = [Truth(["spce"] * 3, seed) for seed in (43, 44)]
+    texts = []
+    for truth in truths:
+        atoms = truth.atoms()
+        rows = [(name, tuple(x)) for name, _, _, x, _ in atoms]
+        texts.append(as_g96(rows, truth.cell, [v for *_, v in atoms]))
+    text = texts[0] + "TIMESTEP\n 5 0.01\nEND\n" + texts[1].replace("TITLE\nwater\nEND\n", "")
+    with pytest.raises(StructureError, match="holds 2 structures"):
+        read(tmp_path, text, "a.g96")
+    for frame, truth in ((1, truths[0]), (2, truths[1])):
+        found = read(tmp_path, text, "a.g96", frame=frame)
+        partner = same_molecules(found, truth, [SPECIES["spce"]], 1e-4)
+        assert found.velocity == pytest.approx(truth.velocity[partner], abs=1e-4)
+    for old, new, message in (
+        ("BOX", "BOX\n1 2 3 4", "expected the box, 3 or 9 numbers"),
+        ("    1 MIX   OW         1", "    1                   ", "expected residue number, residue name, atom name"),
+        ("END\nBOX", "BOX", "three numbers of VELOCITY from column 25"),
+    ):
+        with pytest.raises(StructureError, match=message):
+            read(tmp_path, texts[0].replace(old, new), "a.g96")
+    with pytest.raises(StructureError, match="its block POSITION has no END: truncated"):
+        read(tmp_path, texts[0][: texts[0].index("END\nVEL")], "a.g96")
+    with pytest.raises(StructureError, match="names an atom Zz, but ASE, which reads this format, knows elements only"):
+        read(tmp_path, as_gen([("Zz", (0, 0, 0))], np.diag([9.0] * 3)), "a.gen")
 
 
 # damage

@@ -149,6 +149,28 @@ def test_each_molecule_of_a_universe_is_one_fragment(tmp_path, model, sites, kep
     assert np.isfinite(found["eps_mean"])
 
 
+@pytest.mark.parametrize("ending", EVERY_ENDING)
+@pytest.mark.parametrize("frame", [1, -1])
+def test_united_atoms_of_own_trajectories(tmp_path, ending, frame):
+    """Sites with mass and no element, and sites with neither, are found by their names in every format."""
+    system = build(small_scene({"co2_2cljq": 4}, 20.0))
+    moved = system.state.copy()
+    moved.position[:] += [3.0, 1.0, -2.0]
+    path = tmp_path / f"old{ending}"
+    file = open_trajectory(path, system, 1.0, False, False)
+    for k, state in enumerate((system.state, moved)):
+        file.write(state, float(k), k)
+    file.close()
+    write_topology(tmp_path / "topology.gro", system, moved, wrapped=True)
+    found = read_structure(
+        path, [load_model("co2_2cljq")], None, True, 0.15, frame=frame, topology=tmp_path / "topology.gro"
+    )
+    state = moved if frame == -1 else system.state
+    step = (found.position - state.position) / 20.0
+    assert np.abs(step - np.round(step)).max() < 1e-3
+    assert found.residual_max < 0.02
+
+
 def test_times_in_single_precision_are_evened_where_they_can_be():
     times = 4.3e6 + 0.1 * np.arange(200)
     rounded = times.astype(np.float32).astype(float)

@@ -17,7 +17,7 @@ from rigidmd.core.process import format_gigabytes, memory_shortage
 from rigidmd.errors import UNPRINTABLE
 from rigidmd.io.formats import BY_CONTENT, BY_EXTENSION, TOPOLOGIES, Format, format_of
 from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, element_of, structure_error
-from rigidmd.io.formats.through_ase import from_ase, read_by_ase
+from rigidmd.io.formats.through_ase import from_ase, read_by_ase, read_text_by_ase
 from rigidmd.io.formats.through_mdanalysis import index_of, read_in_process
 from rigidmd.scene.validation import not_none
 
@@ -148,12 +148,14 @@ def _frames(path: Path, atom_types: dict[str, str] | None, content: bytes | None
         raise structure_error(path, _no_types())
     if form is not None and form.read is not None:
         return form.read(path, text.splitlines(), *([atom_types] if form.has_types else []))
-    with tempfile.TemporaryDirectory() as folder:
-        source = path
-        if name.name != path.name or wide or content.startswith(codecs.BOM_UTF8):
+    if (is_binary := b"\0" in content and not wide) and name.name == path.name:
+        return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, path)]
+    if is_binary:
+        with tempfile.TemporaryDirectory() as folder:
             source = Path(folder) / name.name
-            source.write_bytes(text.encode() if wide else content.removeprefix(codecs.BOM_UTF8))
-        return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, source)]
+            source.write_bytes(content)
+            return [partial(from_ase, path, atoms) for atoms in read_by_ase(path, source)]
+    return [partial(from_ase, path, atoms) for atoms in read_text_by_ase(path, text, name.name)]
 
 
 def _content(path: Path) -> bytes:

@@ -17,7 +17,7 @@ CHARMM_IONS = {"SOD": "Na", "POT": "K", "CES": "Cs", "CLA": "Cl", "LIT": "Li", "
 #: CHARMM's names of the oxygen and the massless site of four-site waters, both of which begin like oxygen.
 CHARMM_WATER = ("OH2", "OM")
 #: Names of massless sites: M of four-site waters, L of five-site ones, and the names that programs give them.
-MASSLESS = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM?|VS|XX?|Q)\d*", re.IGNORECASE)
+MASSLESS_NAME = re.compile(r"(M|MW|MT|EPW?|LPW?[A-Z]?|LP?|LW|IW|DUM?|VS|XX?|Q)\d*", re.IGNORECASE)
 
 
 class Atoms(NamedTuple):
@@ -45,9 +45,9 @@ def element_of(name: str, vocabulary: frozenset[str] = frozenset()) -> str:
     if len(two) == 2 and (letters[:2] == two or letters.upper() in ("CL", "BR")) and is_element(two):
         return two
     found = next((e for e in (two, one) if e in vocabulary), "")
-    if not found and MASSLESS.fullmatch(name):
+    if not found and MASSLESS_NAME.fullmatch(name):
         return "X"
-    return found or next((e for e in (one, two) if is_element(e)), "")
+    return found or next((e for e in (one, two) if is_element(e) or e in HEAVY_HYDROGEN), "")
 
 
 def is_element(symbol: str) -> bool:

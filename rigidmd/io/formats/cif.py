@@ -10,10 +10,11 @@ import numpy as np
 
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, register
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, MASSLESS, Atoms, element_of, is_element, structure_error
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, MASSLESS_NAME, Atoms, element_of, is_element, structure_error
 from rigidmd.io.formats.cells import cell_of, describe_cell
 from rigidmd.io.formats.crystal import (
     IDENTITY,
+    NoSymmetry,
     Setting,
     Statement,
     UnitCell,
@@ -144,7 +145,7 @@ def _structure(path: Path, block: Block, rows: list[int]) -> Atoms:
     kinds = [element or element_of(name) or name for name, element in zip(names, elements, strict=True)]
     try:
         whole = unit_cell(position, kinds, _radii(kinds), operations, cell)
-    except ValueError as error:
+    except NoSymmetry as error:
         reason = "its atoms are disordered, or have another symmetry than it states"
         raise structure_error(path, f"{error} in the cell: {reason}{_as_read(notes)}") from None
     owner = whole.owner
@@ -218,7 +219,7 @@ def _element(symbol: str) -> str:
     is_upper = len(letters) == 2 and letters.isupper() and is_element(letters[0])  # CO, HO
     if (is_element(element) or element in HEAVY_HYDROGEN) and not is_upper:
         return element
-    return "X" if MASSLESS.fullmatch(symbol) else ""
+    return "X" if MASSLESS_NAME.fullmatch(symbol) else ""
 
 
 def _radii(kinds: list[str]) -> np.ndarray:

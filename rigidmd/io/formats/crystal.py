@@ -30,6 +30,10 @@ MONOCLINIC = range(3, 16)  # numbers of space groups
 SUFFIXES = {"S": "1", "Z": "2", "H": "h", "R": "r"}
 
 
+class NoSymmetry(Exception):
+    """Symmetry and positions contradict each other."""
+
+
 class Setting(NamedTuple):
     """Operations that a file may mean."""
 
@@ -204,7 +208,7 @@ def unit_cell(
     """All atoms of the cell (3, 3), each once. Atoms on special positions are put exactly there.
 
     fractional : (n, 3) coordinates of the atoms of the file. kinds : what atoms at one position must share.
-    radii : (n,) covalent radii, Å. Raises ValueError where symmetry and positions contradict each other.
+    radii : (n,) covalent radii, Å. Raises NoSymmetry.
     """
     parts = [_images(x, SAME_ATOM * radius, operations, cell) for x, radius in zip(fractional, radii, strict=True)]
     owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
@@ -218,7 +222,7 @@ def unit_cell(
     copies = set()
     for one, other, length in zip(first[near].tolist(), second[near].tolist(), distance[near].tolist(), strict=True):
         if kinds[one] != kinds[other]:
-            raise ValueError(f"atoms {one + 1} and {other + 1} are {length:.2g} Å apart")
+            raise NoSymmetry(f"atoms {one + 1} and {other + 1} are {length:.2g} Å apart")
         if one not in copies:
             copies.add(other)
     kept = ~np.isin(owner, list(copies))
@@ -239,5 +243,5 @@ def _images(x: np.ndarray, tolerance: float, operations: np.ndarray, cell: np.nd
     same = np.linalg.norm(step @ cell, axis=2) <= tolerance
     images = images[same.argmax(axis=1) == np.arange(len(images))]
     if len(images) * fixed.sum() != len(operations):
-        raise ValueError("an atom is too near to its own images by symmetry")
+        raise NoSymmetry("an atom is too near to its own images by symmetry")
     return images % 1.0

@@ -16,6 +16,7 @@ from rigidmd.io.formats.through_mdanalysis import FrameFiles, dimensions
 
 #: Columns of the edges and angles in CRYST1.
 CRYST1 = (6, 15, 24, 33, 40, 47, 54)
+SPACE_GROUP = slice(55, 66)
 #: A coordinate in its columns, and three coordinates beyond them, which may follow the last digits of a residue number.
 IN_COLUMNS = re.compile(r" *-?\d+\.\d{3}")
 BEYOND = re.compile(r"\w{0,3}\s" + 3 * r"\s*(-?\d+\.\d{3})")
@@ -45,9 +46,19 @@ def _cryst1(line: int, text: str) -> tuple[np.ndarray | None, list[str]]:
             values = [float(word) for word in words]
             if len(values) == 6:
                 cell = cell_of(values)
-                text = " ".join(f"{x:g}" for x in values)
-                return cell, [] if cell is not None else [f"line {line}: CRYST1 of {text} defines no cell"]
+                edges = " ".join(f"{x:g}" for x in values)
+                if cell is None:
+                    return None, [f"line {line}: CRYST1 of {edges} defines no cell"]
+                return cell, _space_group_note(line, text)
     return None, [f"line {line}: CRYST1 needs three edges and three angles, found {text[6:].strip()!r}"]
+
+
+def _space_group_note(line: int, text: str) -> list[str]:
+    """A note if CRYST1 names a space group with further symmetry operations, which are not applied."""
+    name = text[SPACE_GROUP].strip()
+    if not name or name.replace(" ", "") in ("P1", "1"):
+        return []
+    return [f"line {line}: the space group {name} is not applied: its atoms were taken as all atoms of the cell"]
 
 
 def _pdb_model(path: Path, body: list[tuple[int, str]], cell: np.ndarray | None, notes: list[str]) -> Atoms:

@@ -8,6 +8,8 @@ It is read item by item, and sizes are checked before arrays are allocated.
 import contextlib
 import io
 import os
+import re
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -16,8 +18,9 @@ import numpy as np
 
 from rigidmd.core.process import ignore_warnings
 from rigidmd.core.state import NOW, State
+from rigidmd.errors import StructureError
 from rigidmd.io.formats import Format, System, extensions, register
-from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, Atoms, Frame, is_element, structure_error
+from rigidmd.io.formats.atoms import HEAVY_HYDROGEN, MASSLESS_NAME, Atoms, Frame, is_element, structure_error
 from rigidmd.io.formats.frame_file import FrameFile
 from rigidmd.units import ENERGY_UNITS
 
@@ -31,6 +34,8 @@ EV = ENERGY_UNITS["eV"]
 ASE_VELOCITY = 98.22694788464063
 #: ASE's arrays of names of atoms and residues, as from .pdb. Extended XYZ may have them as columns.
 NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS = "atomtypes", "residuenames", "residuenumbers"
+#: ASE's array of what follows its symbols in the names of DL_POLY's files.
+DL_POLY_NAMES = "dlp4_labels"
 #: Columns of velocities in extended XYZ that ASE does not convert, because programs use different units.
 UNITLESS_VELOCITIES = ("vel", "velo", "velocity", "velocities")
 
@@ -46,17 +51,63 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
         known = " ".join(extensions(lambda form: form.read or form.reader))
         raise structure_error(path, f"its format is unknown to ASE; there are {known}") from None
     except Exception as error:  # ASE's readers raise many types, from ImportError to IndexError
-        reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
-        hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
-        message = f"ASE, which reads this format, ends with {type(error).__name__}: {reason}. {hint}"
-        raise structure_error(path, message) from None
+        raise structure_error(path, _reason(error)) from None
     return [atoms for atoms in found if len(atoms)]
+
+
+def _reason(error: Exception) -> str:
+    """What an exception of ASE's readers says, in words for users."""
+    reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
+    symbol = re.search(r"['\"](\w{1,8})['\"]", reason)
+    if symbol and ("symbol" in reason or isinstance(error, KeyError)) and not is_element(symbol[1]):
+        named = f"names an atom {symbol[1]}, but ASE, which reads this format, knows elements only"
+        return f"{named}. Use elements (X for sites without mass), or a .gro, .pdb or .xyz, which may have any names"
+    hint = "Is the file complete and named by its format? A .xyz, .pdb or .gro made of it may help"
+    return f"ASE, which reads this format, ends with {type(error).__name__}: {reason}. {hint}"
+
+
+def read_text_by_ase(path: Path, text: str, name: str) -> "list[AseAtoms]":
+    """The structures in the text of a file of this name. Massless sites become X and, where ASE needs it, heavy
+    hydrogen becomes H. Raises StructureError."""
+    first = None
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / name
+        plain = without_massless_names(text)
+        for variant in dict.fromkeys((plain, without_isotopes(plain), text)):
+            source.write_text(variant, encoding="utf-8")
+            try:
+                return read_by_ase(path, source)
+            except StructureError as error:
+                first = first or error
+    raise first
+
+
+def without_massless_names(text: str) -> str:
+    """A text in which names of massless sites are X, the only such name that ASE knows, with columns unchanged."""
+
+    def renamed(match: re.Match) -> str:
+        return match[0] if is_element(match[0].capitalize()) else "X".ljust(len(match[0]))
+
+    return re.sub(rf"(?<!\S){MASSLESS_NAME.pattern}(?!\S)", renamed, text, flags=re.IGNORECASE)
+
+
+def without_isotopes(text: str) -> str:
+    """A text in which D and T are H: ASE has no symbols for heavy hydrogen."""
+    return re.sub(r"(?<!\S)[DT](?!\S)", "H", text)
 
 
 def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atoms:
     """Atoms in Å, ps and u from ASE's, with its masses unless they are its standard ones. By default, names and
-    elements are ASE's symbols."""
+    residues are those in the arrays that ASE and rigidmd store, or else names are ASE's symbols."""
     symbols, notes = atoms.get_chemical_symbols(), []
+    if names is None and (stored := atoms.arrays.get(NAMES)) is not None:
+        names = [str(name) for name in stored]
+        symbols = ["" if symbol == "X" else symbol for symbol in symbols]  # united atoms have names only
+    elif names is None and DL_POLY_NAMES in atoms.arrays:
+        names = [symbol + str(rest) for symbol, rest in zip(symbols, atoms.arrays[DL_POLY_NAMES], strict=True)]
+        symbols = [""] * len(atoms)  # ASE takes the first letters, N for NA
+    if residue is None:
+        residue = _residues(atoms)
     if names is not None and len(names) != len(atoms):
         raise structure_error(path, f"has {len(names)} atoms, of which ASE reads {len(atoms)}")
     occupied = {(e, x) for site in (atoms.info.get("occupancy") or {}).values() for e, x in site.items()}
@@ -85,6 +136,14 @@ def from_ase(path: Path, atoms, names=None, elements=None, residue=None) -> Atom
         symbols if names is None else names, symbols if elements is None else elements,
         [()] * len(atoms) if residue is None else residue, atoms.get_positions(), velocity, cell, masses, notes,
     )  # fmt: skip
+
+
+def _residues(atoms) -> list[tuple] | None:
+    """Residues from ASE's arrays of them; None without."""
+    names, numbers = (atoms.arrays.get(key) for key in (RESIDUE_NAMES, RESIDUE_NUMBERS))
+    if names is None or numbers is None or numbers.dtype.kind != "i":
+        return None
+    return [(int(n), str(name)) for n, name in zip(numbers, names, strict=True)]
 
 
 def atoms_of_system(system: System, state: State, wrapped: bool = False) -> "ase.Atoms":

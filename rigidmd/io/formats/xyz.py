@@ -12,7 +12,7 @@ from rigidmd.io.formats import Encode, Format, System, register
 from rigidmd.io.formats.atoms import (
     HEAVY_HYDROGEN, Atoms, Frame, atom_count, is_element, numbers, unexpected, without_fortran,
 )  # fmt: skip
-from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, from_ase, read_by_ase
+from rigidmd.io.formats.through_ase import NAMES, from_ase, read_by_ase
 from rigidmd.io.formats.through_mdanalysis import FrameFiles
 
 
@@ -54,7 +54,7 @@ def read_xyz(path: Path, lines: list[str], atom_types: dict[str, str] | None = N
         names, elements = map(list, zip(*of_frame, strict=True)) if named else (None, None)
         if NAMES in atoms.arrays:
             names = [str(name) for name in atoms.arrays[NAMES]]
-        frames.append(partial(from_ase, path, atoms, names, elements, _residues(atoms)))
+        frames.append(partial(from_ase, path, atoms, names, elements))
     return frames
 
 
@@ -67,14 +67,6 @@ def _label(name: str, atom_types: dict[str, str] | None) -> tuple[str, str]:
         name = chemical_symbols[number]
     symbol = name.capitalize()
     return name, symbol if is_element(symbol) or symbol in HEAVY_HYDROGEN else ""
-
-
-def _residues(atoms) -> list[tuple] | None:
-    """Residues from ASE's arrays of them; None without."""
-    names, numbers = (atoms.arrays.get(key) for key in (RESIDUE_NAMES, RESIDUE_NUMBERS))
-    if names is None or numbers is None or numbers.dtype.kind != "i":
-        return None
-    return [(int(n), str(name)) for n, name in zip(numbers, names, strict=True)]
 
 
 def _columns(properties: str) -> tuple[int | None, int | None, int]:

@@ -1,0 +1,97 @@
+"""G96, of GROMACS and GROMOS. ASE takes NA for N, and reads neither velocities nor frames."""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from rigidmd.core.toml import parse_whole_number
+from rigidmd.io.formats import Format, register
+from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
+
+#: Columns before the coordinates: number and name of the residue, name and number of the atom.
+HEAD = 24
+#: Names of blocks; those that end in RED have coordinates only.
+POSITIONS, VELOCITIES = ("POSITION", "POSITIONRED"), ("VELOCITY", "VELOCITYRED")
+
+#: A line and its number.
+Lines = list[tuple[int, str]]
+
+
+def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
+    """The frames of a .g96: blocks from a name to END, of which POSITION begins a frame."""
+    frames: list[dict[str, Lines]] = []
+    block, content = "", []
+    for number, line in enumerate(lines, 1):
+        text = line.strip()
+        if text.startswith("#") or (not text and not block):
+            continue
+        if not block:
+            block, content = text, []
+        elif text == "END":
+            if block in POSITIONS:
+                frames.append({})
+            if frames:
+                frames[-1][block] = content
+            block = ""
+        else:
+            content.append((number, line))
+    if block:
+        raise structure_error(path, f"its block {block} has no END: truncated?")
+    return [partial(_frame, path, frame, frames[0]) for frame in frames]
+
+
+def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atoms:
+    """A frame; names are in its block POSITION or in that of the first frame."""
+    named = frame.get("POSITION", first.get("POSITION"))
+    if named is None:
+        raise structure_error(path, "has no block POSITION, and so no names of atoms")
+    position = _vectors(path, frame, POSITIONS)
+    velocity = _vectors(path, frame, VELOCITIES)
+    for what, found in (("positions", position), ("velocities", velocity)):
+        if found is not None and len(found) != len(named):
+            raise structure_error(path, f"has {len(found)} {what} of {len(named)} atoms")
+    names, residue = [], []
+    for number, line in named:
+        words = line[:HEAD].split()
+        if len(words) < 3:
+            raise unexpected(path, number, "residue number, residue name, atom name", line.strip())
+        names.append(words[2])
+        residue.append((parse_whole_number(words[0]), words[1]))
+    return Atoms(names, [""] * len(names), residue, position, velocity, _box(path, frame))
+
+
+def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np.ndarray | None:
+    """Vectors (n, 3) of a block in Å or Å/ps; None without one."""
+    name = next((block for block in blocks if block in frame), None)
+    if name is None:
+        return None
+    start = 0 if name.endswith("RED") else HEAD
+    rows = []
+    for number, line in frame[name]:
+        words = line[start:].split()
+        if len(words) != 3:
+            raise unexpected(path, number, f"three numbers of {name} from column {start + 1}", line.strip())
+        rows.append(numbers(path, number, words, f"three numbers of {name}"))
+    return 10 * np.array(rows).reshape(-1, 3)
+
+
+def _box(path: Path, frame: dict[str, Lines]) -> np.ndarray | None:
+    """The cell (3, 3) of a block BOX, three edges or nine numbers, in Å."""
+    content = frame.get("BOX", [])
+    words = [word for _, line in content for word in line.split()]
+    if not words:
+        return None
+    line, what = content[0][0], "the box, 3 or 9 numbers"
+    edges = numbers(path, line, words, what)
+    if len(edges) not in (3, 9):
+        raise unexpected(path, line, what, " ".join(words))
+    xx, yy, zz, xy, xz, yx, yz, zx, zy = [*edges, *[0.0] * (9 - len(edges))]
+    return 10 * np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
+
+
+register(Format(
+    (".g96",), read=read_g96, content=re.compile(r"\ATITLE[ \t]*\n(?:.*\n)*?(?:TIMESTEP|POSITION)"),
+))  # fmt: skip
