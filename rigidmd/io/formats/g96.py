@@ -10,6 +10,7 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
+from rigidmd.scene.validation import not_none
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24
@@ -48,7 +49,7 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
     named = frame.get("POSITION", first.get("POSITION"))
     if named is None:
         raise structure_error(path, "has no block POSITION, and so no names of atoms")
-    position = _vectors(path, frame, POSITIONS)
+    position = not_none(_vectors(path, frame, POSITIONS))
     velocity = _vectors(path, frame, VELOCITIES)
     for what, found in (("positions", position), ("velocities", velocity)):
         if found is not None and len(found) != len(named):

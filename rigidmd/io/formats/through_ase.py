@@ -69,17 +69,17 @@ def _reason(error: Exception) -> str:
 def read_text_by_ase(path: Path, text: str, name: str) -> "list[AseAtoms]":
     """The structures in the text of a file of this name. Massless sites become X and, where ASE needs it, heavy
     hydrogen becomes H. Raises StructureError."""
-    first = None
+    faults = []
+    plain = without_massless_names(text)
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / name
-        plain = without_massless_names(text)
         for variant in dict.fromkeys((plain, without_isotopes(plain), text)):
             source.write_text(variant, encoding="utf-8")
             try:
                 return read_by_ase(path, source)
             except StructureError as error:
-                first = first or error
-    raise first
+                faults.append(error)
+    raise faults[0]
 
 
 def without_massless_names(text: str) -> str:
