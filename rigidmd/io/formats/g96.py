@@ -45,7 +45,7 @@ def read_g96(path: Path, lines: list[str]) -> list[Callable[[], Atoms]]:
 
 
 def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atoms:
-    """A frame; names are in its block POSITION or in that of the first frame."""
+    """A frame; names are in its block POSITION, or else in the first frame."""
     named = frame.get("POSITION", first.get("POSITION"))
     if named is None:
         raise structure_error(path, "has no block POSITION, and so no names of atoms")
