@@ -56,7 +56,7 @@ def read_by_ase(path: Path, source: Path | io.StringIO, **options: Any) -> "list
 
 
 def _reason(error: Exception) -> str:
-    """What an exception of ASE's readers says, in words for users."""
+    """A message for users on an exception of the readers of ASE."""
     reason = " ".join(str(error).split()).rstrip(".") or "something is missing or misplaced"
     symbol = re.search(r"['\"](\w{1,8})['\"]", reason)
     if symbol and ("symbol" in reason or isinstance(error, KeyError)) and not is_element(symbol[1]):
