@@ -10,7 +10,6 @@ import numpy as np
 from rigidmd.core.toml import parse_whole_number
 from rigidmd.io.formats import Format, register
 from rigidmd.io.formats.atoms import Atoms, numbers, structure_error, unexpected
-from rigidmd.scene.validation import not_none
 
 #: Columns before the coordinates: number and name of the residue, name and number of the atom.
 HEAD = 24
@@ -49,10 +48,9 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
     named = frame.get("POSITION", first.get("POSITION"))
     if named is None:
         raise structure_error(path, "has no block POSITION, and so no names of atoms")
-    position = not_none(_vectors(path, frame, POSITIONS))
-    velocity = _vectors(path, frame, VELOCITIES)
+    position, velocity = (_vectors(path, frame, blocks) for blocks in (POSITIONS, VELOCITIES))
     for what, found in (("positions", position), ("velocities", velocity)):
-        if found is not None and len(found) != len(named):
+        if len(found) not in (0, len(named)):
             raise structure_error(path, f"has {len(found)} {what} of {len(named)} atoms")
     names, residue = [], []
     for number, line in named:
@@ -61,17 +59,15 @@ def _frame(path: Path, frame: dict[str, Lines], first: dict[str, Lines]) -> Atom
             raise unexpected(path, number, "residue number, residue name, atom name", line.strip())
         names.append(words[2])
         residue.append((parse_whole_number(words[0]), words[1]))
-    return Atoms(names, [""] * len(names), residue, position, velocity, _box(path, frame))
+    return Atoms(names, [""] * len(names), residue, position, velocity if len(velocity) else None, _box(path, frame))
 
 
-def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np.ndarray | None:
-    """Vectors (n, 3) of a block in Å or Å/ps; None without one."""
-    name = next((block for block in blocks if block in frame), None)
-    if name is None:
-        return None
+def _vectors(path: Path, frame: dict[str, Lines], blocks: tuple[str, ...]) -> np.ndarray:
+    """Vectors (n, 3) of a block in Å or Å/ps; (0, 3) without one."""
+    name = next((block for block in blocks if block in frame), "")
     start = 0 if name.endswith("RED") else HEAD
     rows = []
-    for number, line in frame[name]:
+    for number, line in frame.get(name, ()):
         words = line[start:].split()
         if len(words) != 3:
             raise unexpected(path, number, f"three numbers of {name} from column {start + 1}", line.strip())
