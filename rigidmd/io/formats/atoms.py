@@ -83,7 +83,7 @@ def names_of_types(
         errors.append(f"structure.atom_types has no name for type {', '.join(unnamed)}")
     if errors:
         raise StructureError(str(path), errors)
-    return [atom_types[given[kind]] for kind in types]
+    return [atom_types[given[kind] or kind] for kind in types]
 
 
 class Frame(NamedTuple):
