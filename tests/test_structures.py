@@ -269,7 +269,7 @@ REFERENCE = [
     ),
     ("awkward/short-cryst1.pdb", "spce", None, 3, density(3, WATER, 15.0**3), 0.0489, 0.0601, ""),
     ("awkward/water4_tinker.arc", "spce", None, "ASE, which reads this format, ends with RuntimeError"),
-    ("awkward/water_spc_99_chem.cssr", "spce", None, "its format is unknown to ASE; there are .cif .data .ent .extxyz .gro "),
+    ("awkward/water_spc_99_chem.cssr", "spce", None, "its format is unknown to ASE; there are .cif .data .ent .extxyz .g96 "),
     ("awkward/triclinic-1.lmp", "spce", None, "holds no atoms"),
     ("awkward/missing_atomname.gro", "spce", None, "has atoms named (no name)"),
     ("awkward/missing_atomname.gro", "argon", None, "has atoms named (no name)"),
