@@ -241,7 +241,10 @@ def test_what_is_no_file_is_not_read(kind, name, argon, tmp_path):
     if name != "final.npz":
         with pytest.raises(OutputError, match=name):
             (read_results if name in (ANALYSIS, "rdf.csv") else read_record)(folder)
-    if name in ("summary.json", "log.csv") or (name == "final.npz" and kind != "huge"):
+    if "link" in kind and name in ("summary.json", "log.csv", "final.npz"):
+        with pytest.raises(OutputError, match=f"{name} is a link out of its folder"):
+            compare(folder, argon)
+    elif name in ("summary.json", "log.csv") or (name == "final.npz" and kind != "huge"):
         assert any(name in text for text in compare(folder, argon).missing)
 
 
@@ -254,3 +257,25 @@ def test_a_pipe_hangs_no_command(command, name, argon, tmp_path, capsys):
     said = capsys.readouterr()
     assert code == (1 if command == "compare" else 2)
     assert f"{folder / name} cannot be read: it is a pipe" in said.out + said.err
+
+
+@pytest.mark.parametrize("name", ["log.csv", "summary.json", "trajectory.xtc", "scene.toml", "rdf.csv"])
+@pytest.mark.parametrize("command", ["report", "view", "analyse", "resume", "film"])
+def test_no_link_out_of_the_folder_of_a_run_is_followed(command, name, argon, tmp_path, capsys):
+    folder = copied(argon, tmp_path)
+    elsewhere = tmp_path / "elsewhere"
+    if (folder / name).exists():
+        (folder / name).rename(elsewhere)
+    else:
+        elsewhere.write_text("salary_of_alice,r (Å)\n1,2\n")
+    (folder / name).symlink_to(elsewhere)
+    assert cli.main([command, str(folder)]) == 2
+    said = capsys.readouterr()
+    assert f"{folder / name} is a link out of its folder" in said.err and "salary" not in said.out + said.err
+
+
+def test_a_link_within_the_folder_of_a_run_is_followed(argon, tmp_path):
+    folder = copied(argon, tmp_path)
+    (folder / "log.csv").rename(folder / "log_of_the_run.csv")
+    (folder / "log.csv").symlink_to("log_of_the_run.csv")
+    assert len(read_record(folder).columns["time"]) == len(read_record(argon).columns["time"])

@@ -39,12 +39,13 @@ from support import (
     provenance,
     read_checkpoint,
     same_after_stops,
+    small_scene,
     stopped_at,
     write_checkpoint,
 )
 
 from rigidmd.commands import cli
-from rigidmd.errors import CheckpointError, OutputError, SimulationError
+from rigidmd.errors import CheckpointError, OutputError, RigidMDWarning, SimulationError
 from rigidmd.run import Every, Simulation, run_together
 from rigidmd.scene import Scene
 
@@ -300,8 +301,12 @@ BROKEN = {
     "no log": (lambda run: (run / "log.csv").unlink(), [], "log.csv: there is no such file"),
     "no trajectory": (lambda run: (run / "trajectory.xtc").unlink(), [], "trajectory.xtc: there is no such file"),
     "a short log": (lambda run: os.truncate(run / "log.csv", 50), [], "log.csv is shorter than it was"),
-    "a linked log": (lambda run: linked(run / "log.csv"), [], "log.csv: is a link"),
-    "a linked trajectory": (lambda run: linked(run / "trajectory.xtc"), [], "trajectory.xtc: is a link"),
+    "a linked log": (lambda run: linked(run / "log.csv"), [], "log.csv is a link out of its folder"),
+    "a linked trajectory": (
+        lambda run: linked(run / "trajectory.xtc"),
+        [],
+        "trajectory.xtc is a link out of its folder",
+    ),
     "a piped log": (lambda run: piped(run / "log.csv"), [], "log.csv: is a pipe, a socket or a device"),
     "a shorter scene": (lambda run: None, ["--until", "0.001ps"], "already longer"),
     "another seed": (lambda run: change(run / "scene.toml", "seed = 1", "seed = 2"), [], "seed is 2, there 1"),
@@ -391,7 +396,7 @@ def test_no_command_writes_through_a_link(command, again, capsys):
         before = everything(away)
         ended = cli.main(arguments.get(command, [command, str(run)]))
         assert everything(away) == before, names
-        refuses = command == "sweep" or (command == "resume" and names[0] in ("log.csv", "trajectory.xtc"))
+        refuses = command != "run" and names != [".rigidmd-lock"]
         assert ended == (2 if refuses else 0), (names, capsys.readouterr().err)
 
 
@@ -914,3 +919,82 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
     assert cli.main(["run", str(tmp_path / "water.toml"), "-o", str(tmp_path / "whole")]) == 0
     whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "runs" / "water")
     assert [name for name in whole if whole[name] != parts[name]] == []
+
+
+# --- files that vanish during a run ----------------------------------------------------------------------------------
+
+
+def taken_away(path: Path, how: str) -> None:
+    """Remove a file, or put another one in its place."""
+    if how == "removed":
+        path.unlink()
+    else:
+        content = path.read_bytes()
+        path.unlink()
+        path.write_bytes(content)
+
+
+def loses(tmp_path: Path, name: str, how: str, stages: int, **output) -> Simulation:
+    """A run whose file is removed or replaced after its first step, in stages of two steps."""
+    trajectory = name if name.startswith("trajectory") else "trajectory.xtc"
+    data = {
+        "stages": [{"duration_ps": 0.004}] * stages,
+        "output": {"figures": False, "trajectory": trajectory} | output,
+    }
+    once = [True]
+
+    def act(moment):
+        if moment.step == 1 and once.pop():
+            taken_away(tmp_path / "run" / name, how)
+            once.append(False)
+
+    return Simulation(small_scene({"argon": 8}, 20.0, **data), tmp_path / "run", observers=[Every(0.002, act)])
+
+
+VANISHING = [
+    ("log.csv", "removed"),
+    ("trajectory.xtc", "replaced by another file"),
+    ("trajectory.gsd", "removed"),
+]
+
+
+@pytest.mark.parametrize(("name", "how"), VANISHING)
+def test_a_file_that_vanishes_stops_the_run_at_the_next_checkpoint(name, how, tmp_path):
+    with pytest.raises(OutputError, match=rf"stopped at step 2 .*{name} was {how} while the run was writing it"):
+        loses(tmp_path, name, how, stages=2).run()
+    assert not (tmp_path / "run" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("checkpoints", [True, False])
+@pytest.mark.parametrize(("name", "how"), VANISHING)
+def test_a_file_that_vanishes_in_the_last_stage_is_noted_and_not_listed(name, how, checkpoints, tmp_path):
+    output = {} if checkpoints else {"checkpoint_minutes": False}
+    with pytest.warns(RigidMDWarning, match=f"{name} was {how} while the run was writing it"):
+        results = loses(tmp_path, name, how, stages=1, **output).run()
+    listed = json.loads((tmp_path / "run" / "summary.json").read_text())["files"]
+    assert listed == [str(path) for path in results.files]
+    assert all(Path(path).is_file() for path in listed)
+    assert (str(tmp_path / "run" / name) in listed) == (how != "removed")
+    assert len(results["time"]) == 2
+
+
+# --- the duration of the last stage ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ramp", [{"temperature_K": [90.0, 140.0]}, {"temperature_K": [140.0, 90.0]}])
+def test_the_duration_of_a_ramp_stays(ramp, tmp_path):
+    """Another duration would be another slope of the temperature from there on."""
+    thermostat = {"ensemble": "nvt"}
+
+    def scene(duration, **temperature):
+        return small_scene(
+            {"argon": 8}, 20.0, stages=[{"duration_ps": duration} | thermostat | temperature], output={"figures": False}
+        )
+
+    Simulation(scene(0.004, **ramp), tmp_path / "ramp").run()
+    with pytest.raises(CheckpointError, match=r"stages\.0\.duration_ps is 0\.008, there 0\.004"):
+        Simulation(scene(0.008, **ramp), tmp_path / "ramp", resume=True).run()
+    level = {"temperature_K": 100.0}
+    Simulation(scene(0.004, **level), tmp_path / "level").run()
+    longer = Simulation(scene(0.008, **level), tmp_path / "level", resume=True).run()
+    assert longer["time"][-1] == pytest.approx(0.008)

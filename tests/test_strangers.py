@@ -10,14 +10,17 @@ import zipfile
 
 import numpy as np
 import pytest
+import tomli_w
+from ase.data import chemical_symbols
 from scenes import FROM_FILE, GOOD, SATELLITE, STRUCTURES
 from support import COLUMNS, Sample, Samples, SavedState, build, line_of, memory, read_molecule, state_of, write_state
 from support import memory_room as room
 from support import wave_vectors as vectors
 
 from rigidmd.commands.cli import main
-from rigidmd.errors import MoleculeError, SceneError, StructureError
+from rigidmd.errors import MoleculeError, RigidMDError, SceneError, StructureError
 from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene.models import SYMBOLS
 
 DEEP = "[" * 1000 + "]" * 1000
 AT_ONCE = 5.0  # s of computing
@@ -417,3 +420,50 @@ def test_an_end_with_more_digits_than_a_number_has(capsys):
         main(["run", "nowhere.toml", "--until", "9" * 400 + "ps"])
     assert ended.value.code == 2
     assert "is not a time with a unit" in capsys.readouterr().err
+
+
+# names of elements and of other things
+
+
+def site_scene(**site):
+    return {
+        "box": {"lengths_A": 20.0}, "start": {"temperature_K": 100.0}, "stages": [{"duration_ps": 0.002}],
+        "molecules": [{"name": "a", "count": 2, "sites": [{"name": "A", "mass_u": 40.0} | site]}],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("element", ["x\ny", "", "o", "Ar Ne", "<b>", "Q" * 5000, "Uue"])
+def test_an_element_is_a_chemical_symbol(element):
+    with pytest.raises(SceneError, match=r"element: is '.*', must be a chemical symbol such as O, or X") as error:
+        Scene.from_dict(site_scene(element=element))
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize("element", ["X", "D", "W", "Og"])
+def test_symbols_of_elements_and_x_are_accepted(element):
+    assert Scene.from_dict(site_scene(element=element)).molecules[0].sites[0].element == element
+
+
+def test_the_elements_are_those_of_ase():
+    assert {*SYMBOLS.split()} == {*chemical_symbols} - {"X"}
+
+
+@pytest.mark.parametrize("name", ["n" * 101, "a\nb", "a\x1b[2J", ""])
+@pytest.mark.parametrize("place", ["species", "parameter", "stage", "model"])
+def test_names_have_one_line_and_at_most_100_characters(place, name, tmp_path):
+    data = site_scene(parameters={name: 1.0} if place == "parameter" else {})
+    if place == "species":
+        data["molecules"][0]["name"] = name
+    if place == "stage":
+        data["stages"][0]["name"] = name
+    if place == "model":
+        (tmp_path / "m.toml").write_text(tomli_w.dumps({"name": name, "sites": data["molecules"][0]["sites"]}))
+        data["molecules"][0] = {"file": "m.toml", "count": 2}
+    with pytest.raises(RigidMDError, match=r"name|parameters") as error:
+        build(Scene.from_dict(data, tmp_path))
+    assert len(str(error.value)) < 500 and "\x1b" not in str(error.value)
+
+
+def test_the_name_of_a_trajectory_fits_into_a_folder():
+    with pytest.raises(SceneError, match="must have at most 200 characters"):
+        Scene.from_dict(site_scene() | {"output": {"trajectory": "t" * 260 + ".xtc"}})

@@ -83,6 +83,23 @@ def check_is_run(folder: Path) -> None:
         raise OutputError(f"{folder} is the folder of a sweep; name one of the runs in it")
     if not (folder / MARKER).is_file() or not (folder / SCENE).is_file():
         raise OutputError(f"{folder} is not the folder of a run: `rigidmd run` wrote no {SCENE} there")
+    for path in folder.iterdir():
+        check_inside(path)
+
+
+def check_inside(path: Path) -> None:
+    """Raise OutputError if a file is a link out of its folder.
+
+    Pages and tables of a run from others would otherwise show what other files of this user contain.
+    """
+    if not path.is_symlink():
+        return
+    try:
+        inside = path.resolve().is_relative_to(path.parent.resolve())
+    except (OSError, RuntimeError):  # a loop of links
+        inside = False
+    if not inside:
+        raise OutputError(f"{path} is a link out of its folder, which is not followed; put a copy of the file there")
 
 
 def add_to_folder(folder: Path, names: Iterable[str]) -> None:

@@ -22,6 +22,7 @@ from rigidmd.core.toml import shorten_repr
 from rigidmd.engines import samples
 from rigidmd.engines.samples import Sample
 from rigidmd.errors import OutputError
+from rigidmd.io.folder import check_inside
 from rigidmd.scene.validation import Flag, Number, validation_messages
 
 #: Limits: bytes of a JSON file and of a CSV file, characters of a line of CSV, absolute value of a number.
@@ -105,9 +106,11 @@ def read_json(path: Path, kind: type[T], remedy: str = "") -> T | None:
 
 
 def _is_there(path: Path, largest: float) -> bool:
-    """Whether a file exists. Raises OutputError for a folder or device, and for a file larger than `largest`."""
+    """Whether a file exists. Raises OutputError for a link out of its folder, for a folder or device, and for a file
+    larger than `largest`."""
     if not path.exists() and not path.is_symlink():
         return False
+    check_inside(path)
     if reason := unreadable_reason(path, largest):
         is_clause = reason.startswith(("is", "has"))
         raise OutputError(f"{path} cannot be read: it {reason}" if is_clause else f"{path}: {reason}")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.compile.cache import compiling_announced, describe_cache
-from rigidmd.core.files import writing
+from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
 from rigidmd.engines.protocol import Halted, NotFiniteError
@@ -27,7 +27,7 @@ from rigidmd.io.folder import CHECKPOINT, PREVIOUS, SUMMARY, FolderLock
 from rigidmd.io.progress import progress_of
 from rigidmd.io.write import write_json
 from rigidmd.run import resume
-from rigidmd.run.observers import Moment, Observer
+from rigidmd.run.observers import GrowingFile, Moment, Observer
 from rigidmd.run.results import Results
 from rigidmd.run.schedule import (
     SEGMENT_SECONDS, CheckpointSchedule, ObservationSchedule, interruptible, signal_handler, stop_signals,
@@ -209,6 +209,7 @@ class RunLoop:
     def _finish(self, preparing: float, wall: float) -> None:
         """Make the results, with all files written; times as in `RunPart.summary`. Raises OutputError."""
         simulation, part, notes = self._simulation, self._part, self._part.record.notes
+        self._note_lost_files()
         results = Results(part.system, part.state, part.samples())
         results.interrupted, results.signal, results.out_of_time = self.interrupted, self.signal, self.out_of_time
         made_by = resume.provenance(simulation.scene, part.threads, part.record.inputs, part.engine_version)
@@ -218,6 +219,7 @@ class RunLoop:
             for observer in self._observers.values():
                 if observer.draws == draws:
                     self._call_observer(observer, observer.end, simulation, results)
+            results.files[:] = [path for path in results.files if path.is_file()]
             files = [*results.files, *([] if self._folder is None else [self._folder / SUMMARY])]
             results.summary["notes"] += notes[noted:]
             if self._folder is not None:
@@ -227,6 +229,15 @@ class RunLoop:
         if self._error is not None:
             raise self._error
 
+    def _note_lost_files(self) -> None:
+        """Note which files another program removed, replaced or changed; the run has no more to write to them."""
+        for observer in self._observers.values():
+            if isinstance(observer, GrowingFile):
+                try:
+                    observer.check_file()
+                except LostFileError as error:
+                    self._simulation.note(str(error))
+
     @np.errstate(over="ignore", invalid="ignore")
     def _failed(self, error: SimulationError | OutputError) -> RigidMDError:
         """The error with its step, time and explanation, and how to resume a run that could not write."""
@@ -235,18 +246,26 @@ class RunLoop:
         step = int(part.state.step[ORIGIN]) + round((time - origin) / part.segment.dt)
         where = f"stopped at step {step} ({time:g} {part.time_unit}): "
         if isinstance(error, OutputError):
+            if isinstance(error, LostFileError):
+                with contextlib.suppress(OutputError):
+                    return OutputError(f"{where}{error}; the run cannot continue it{self._last_words()}")
             advice = ""
             if self._folder is not None and any((self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS)):
                 advice = f". Free disk space and resume from the last checkpoint: rigidmd resume {self._folder}"
             return OutputError(f"{where}{error}{advice}")
-        saved = "".join(observer.failed(self._simulation) for observer in self._observers.values())
-        return SimulationError(f"{where}{part.explain(error)}{saved}")
+        return SimulationError(f"{where}{part.explain(error)}{self._last_words()}")
+
+    def _last_words(self) -> str:
+        """What observers save of a run that fails, as the end of a message."""
+        return "".join(observer.failed(self._simulation) for observer in self._observers.values())
 
     def _read_checkpoint(self, folder: Path) -> tuple[Checkpoint | None, bool]:
         """The checkpoint to resume from, None if the run has to begin, and whether the files of the folder stay."""
         if run_folder.is_empty(folder) or run_folder.never_began(folder):
             self._simulation.announce(f"{folder} holds no run yet: beginning it")
             return None, not run_folder.is_empty(folder)
+        for path in folder.iterdir():
+            run_folder.check_inside(path)
         kept, problems = latest(folder)
         for problem in problems:
             self._simulation.warn(f"{problem}. The checkpoint before it is used")
@@ -257,7 +276,12 @@ class RunLoop:
         part, record = self._part, self._part.record
         if not self.checkpoints.writes or self._error is not None or (memory := part.engine.memory()) is None:
             return  # after an error a run that resumes calls the observer again
-        parts = {name: observer.memory() for name, observer in self._observers.items()}
+        try:
+            parts = {name: observer.memory() for name, observer in self._observers.items()}
+        except LostFileError:
+            if self.is_complete or self.interrupted:
+                return  # the run ends with its other files, and notes this
+            raise
         parts |= {
             RECORD: resume.stored(record, record.types()), "engine": Checkpoint({}, memory),
             "state": Checkpoint({}, dict(zip(STORED_NAMES, part.state, strict=True))),

@@ -169,6 +169,11 @@ class GrowingFile(Observer):
         self.kept = list(self._file.kept)
         return super().memory()
 
+    def check_file(self) -> None:
+        """Raise LostFileError if another program removed, replaced or changed the file."""
+        if self._file is not None:
+            self._file.check()
+
     def cut(self) -> None:
         if self._file is not None:
             self._file.cut()

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from rigidmd.scene.molecules import MolecularScene
 
 LONGEST_NAME = 100
+#: Largest number of characters of the name of a file. File systems allow 255, which temporary files need too.
+LONGEST_FILE_NAME = 200
 #: Keys that name a file.
 FILE_KEYS = re.compile(r"(structure|(molecules|forces\.custom)\.[^.]+)\.(file|topology|parameters|module|table)")
 #: Programs whose input files have these names.
@@ -187,7 +189,7 @@ class Scene(Section, Displayed):
             if not (isinstance(name, str) and FILE_KEYS.fullmatch(key)) or key in (embedded_files or {}):
                 continue
             where, path = location_of(keys, text, overridden), folder / name
-            if not (embedded_files or is_within(key, overridden) or _is_inside(path, folder)):
+            if not (embedded_files or is_within(key, overridden) or is_inside(path, folder)):
                 advice = f"move it there, or set it by --set {key}=PATH"
                 faults.append(f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}")
             elif fault := unreadable_reason(path):
@@ -259,7 +261,7 @@ def default_name(path: Path) -> str:
     return re.sub(r"[^\w.\-]", "_", path.stem).lstrip(".-")[:LONGEST_NAME] or "scene"
 
 
-def _is_inside(path: Path, folder: Path) -> bool:
+def is_inside(path: Path, folder: Path) -> bool:
     """Whether a path is inside a folder. True for a path that cannot be resolved, which is missing."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
@@ -284,7 +286,9 @@ def file_name(wanted: Callable[[Format], Any]) -> AfterValidator:
         if name is None or name is False:
             return name
         if not re.fullmatch(r"[\w\-][\w.\-]*", name):
-            raise ValueError(f"is {name!r}, must be a plain file name without a folder")
+            raise ValueError(f"is {shorten_repr(name)}, must be a plain file name without a folder")
+        if len(name) > LONGEST_FILE_NAME:
+            raise ValueError(f"is {shorten_repr(name)}, must have at most {LONGEST_FILE_NAME} characters")
         if name.startswith("input_"):
             raise ValueError(f"is {name!r}; names beginning with input_ are reserved for copies of input files")
         if not name.endswith(extensions := written(wanted)):

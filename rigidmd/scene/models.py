@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
-from rigidmd.core.toml import impossible_values, read_toml
+from rigidmd.core.toml import impossible_values, read_toml, shorten_repr
 from rigidmd.errors import MoleculeError
 from rigidmd.mechanics.inertia import BodyKind, principal_frame, rotational_freedom
 from rigidmd.scene.validation import (
-    Line, NonNegative, Number, Positive, Section, Vector, did_you_mean, location_of, numbers_out_of_range,
+    Line, NonNegative, Number, Positive, Section, ShortName, Vector, did_you_mean, location_of, numbers_out_of_range,
     validation_messages,
 )  # fmt: skip
 from rigidmd.units import BOLTZMANN, DEBYE, ENERGY_UNITS, KJ_PER_MOL
@@ -36,12 +36,29 @@ LENNARD_JONES = ("sigma_A", *DEPTHS)
 SiteName = Annotated[str, Field(pattern=r"^[!-~]{1,5}$")]
 
 
+SYMBOLS = """
+H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se Br Kr
+Rb Sr Y Zr Nb Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm
+Yb Lu Hf Ta W Re Os Ir Pt Au Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No
+Lr Rf Db Sg Bh Hs Mt Ds Rg Cn Nh Fl Mc Lv Ts Og
+"""
+#: Values of `element`: chemical symbols, deuterium and tritium, and X for a site without an element.
+ELEMENTS = frozenset((*SYMBOLS.split(), "D", "T", "X"))
+
+
+def _checked_element(symbol: str) -> str:
+    if symbol not in ELEMENTS:
+        advice = "names of other kinds of sites belong to name"
+        raise ValueError(f"is {shorten_repr(symbol)}, must be a chemical symbol such as O, or X; {advice}")
+    return symbol
+
+
 class Site(Section):
     """A point of a rigid molecule with optional mass, charge and Lennard-Jones parameters."""
 
     name: SiteName
     """Name in trajectories and topology files, at most five characters"""
-    element: str = "X"
+    element: Annotated[str, AfterValidator(_checked_element)] = "X"
     """Chemical symbol; X for a site without mass"""
     mass_u: NonNegative | None = None
     """Mass; 0 for a massless site. Default with `file`: the mass of the element"""
@@ -57,7 +74,7 @@ class Site(Section):
     """Lennard-Jones well depth; 1 kcal is 4.184 kJ"""
     epsilon_K: NonNegative | None = None
     """Lennard-Jones well depth divided by Boltzmann's constant"""
-    parameters: dict[str, Number] = Field(default={}, max_length=MOST_PARAMETERS)
+    parameters: dict[ShortName, Number] = Field(default={}, max_length=MOST_PARAMETERS)
     """Parameters of custom pair potentials, by name"""
 
     def _errors(self):
@@ -82,8 +99,8 @@ GROUPS = ("water", "ion", "noble gas", "gas", "organic", "other")
 class MoleculeFile(Section):
     """A file of `models/`."""
 
-    name: Line = Field(min_length=1)
-    title: str = ""
+    name: ShortName
+    title: Line = ""
     group: Literal[GROUPS] = "other"  # type: ignore[valid-type]
     """Group in the list of `rigidmd models`"""
     source: str = ""

@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, Strict
 from rigidmd.core.plain_text import distinct
 from rigidmd.errors import SceneError
 from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
-from rigidmd.scene.base import Scene, file_name
+from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.fields import Fields, field_errors
 from rigidmd.scene.forces import FORCE_FILES, Forces
@@ -247,7 +247,14 @@ class MolecularScene(Scene):
         if start.topology is not None or (form := format_of(start.file)) is None or form.read_arrays is None:
             return start.topology
         candidates = [str(Path(start.file).with_name(name)) for name in TOPOLOGIES]
-        return next((name for name in candidates if self.path(name).is_file()), None)
+        found = next((name for name in candidates if self.path(name).is_file()), None)
+        if found is None:
+            return None
+        path = self.path(found)
+        if not any(is_inside(path, folder) for folder in (self.path("."), path.parent)):
+            problem = f"{found} next to the trajectory is a link out of the scene's folder; name it by --set"
+            raise SceneError(self.source, [f"structure.topology: {problem} structure.topology=PATH"])
+        return found
 
     def _errors(self):
         if self.structure is None:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, Strict, field_validator
 from rigidmd.io.formats import extensions
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.scene.models import Site, SiteName, available_models, model_error
-from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section, exact_names
+from rigidmd.scene.validation import Count, Flag, Line, NonNegative, Positive, Section, ShortName, exact_names
 
 #: Keys of [[molecules]] that name a file.
 SPECIES_FILES = ("file", "parameters")
@@ -48,7 +48,7 @@ class Molecules(Section):
     """A shipped model; `rigidmd models` lists them"""
     file: Line | None = None
     """A .toml file with a molecule, like those models, or a geometry in a format of ASE, with `sites` for its atoms"""
-    name: Line | None = None
+    name: ShortName | None = None
     """Name of the species; default: the name of the model or file"""
     sites: tuple[Site, ...] | None = Field(default=None, min_length=1)
     """Sites of a custom molecule; with a geometry `file`, their parameters by atom name or element"""

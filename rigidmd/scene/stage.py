@@ -12,7 +12,7 @@ from rigidmd.scene.couplings import (
     Values,
 )  # fmt: skip
 from rigidmd.scene.integrators import MovedByScheme
-from rigidmd.scene.validation import Count, Line, NameIn, Positive, Section
+from rigidmd.scene.validation import Count, NameIn, Positive, Section, ShortName
 from rigidmd.units import FEMTOSECOND
 
 MOST_STEPS = 1e12
@@ -59,7 +59,7 @@ OTHER_INTEGRATORS = {
 class Timing(Section):
     """The first keys of a stage."""
 
-    name: Line | None = None
+    name: ShortName | None = None
     """Name of the stage; default: the name of the ensemble"""
     ensemble: Ensemble = "nve"
     """Constant: nve energy and volume; nvt temperature and volume; npt temperature and pressure; nph enthalpy and

@@ -65,6 +65,9 @@ class Section(BaseModel):
 #: A name or a path, without line ends and other control characters.
 Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$", max_length=4096)]
 
+#: A name that messages and tables repeat, in one line.
+ShortName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]+$", max_length=100)]
+
 
 class NameIn:
     """Annotation of a text that is a name in a table, which is read anew at each validation. Its JSON schema lists the

@@ -8,10 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.core.files import atomic_file, create_empty_file, unreadable_reason
+from rigidmd.core.files import LostFileError, atomic_file, create_empty_file, unreadable_reason
 from rigidmd.core.state import State
 from rigidmd.errors import OutputError
 from rigidmd.io.formats import System
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and number of a file; None without a file."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 class FrameFile:
@@ -35,6 +44,7 @@ class FrameFile:
         self._velocities, self._wrapped = velocities, wrapped
         self._sum, self._frames, self._kept = 0, 0, kept
         self._file: Any = None
+        self._opened: tuple[int, int] | None = None  # device and number of the file that is open
         if kept is None:
             self._open_new()
         elif kept[1]:
@@ -43,8 +53,15 @@ class FrameFile:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Checksum and number of all frames, which are on the disk."""
+        """Checksum and number of all frames, which are on the disk. Raises OutputError, see `check` too."""
+        self.check()
         return self._sum, self._frames
+
+    def check(self) -> None:
+        """Raise LostFileError if the file was removed or replaced by another program."""
+        if self._file is not None and _identity(self._path) != self._opened:
+            how = "replaced by another file" if self._path.exists() else "removed"
+            raise LostFileError(f"{self._path} was {how} while the run was writing it")
 
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
@@ -63,6 +80,7 @@ class FrameFile:
                 for frame in self._kept_frames():
                     self._append(new, frame)
             self._file = self._open(self._path, "a")
+            self._opened = _identity(self._path)
 
     def close(self) -> None:
         if self._file is not None:
@@ -73,6 +91,7 @@ class FrameFile:
         with self._writing():
             create_empty_file(self._path)
             self._file = self._open(self._path, "w")
+            self._opened = _identity(self._path)
 
     def _kept_frames(self) -> Iterator[Any]:
         """The frames up to the checkpoint. Raises OutputError if they have changed."""

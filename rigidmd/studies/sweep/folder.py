@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import writing
 from rigidmd.errors import OutputError
-from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, offsets_of, written_by_runs
+from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, check_inside, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
 from rigidmd.scene.validation import not_none
@@ -96,6 +96,8 @@ def read_manifest(folder: Path) -> Manifest:
         problem = "keys that are missing in their own groups"
     if problem:
         raise OutputError(f"{path} is not a valid manifest of a sweep: {problem}{remedy}")
+    for name in names:
+        check_inside(folder / name)
     return found
 
 
