@@ -237,6 +237,20 @@ def test_advice_comes_first_names_its_span_and_is_one_line_for_all_errors_that_a
     assert [line.startswith("for an error of Q") for line in said[2:5]] == [True, True, False]
 
 
+def test_energy_without_a_rotation_is_no_accuracy():
+    """A solver that keeps the energy while Q becomes no rotation, or another invariant changes, is not advised for it."""
+    found = made(
+        ("rk4", 1e-2, (1.0, 1.0, 1.0), 1e-3), ("rk4", 2e-3, (5.0, 5.0, 5.0), 1e-9),
+        ("velocity_verlet", 1e-3, (9.0, 9.0, 9.0), 3e-2), ("velocity_verlet", 1e-4, (90.0, 90.0, 90.0), 3e-4),
+    )  # fmt: skip
+    (advice, *_) = recommendations(found)
+    assert "for an energy error of 1e-02" in advice and "rk4 at 0.01 s" in advice
+    for worse in ({"orthogonality_error": 0.33}, {"conserved_errors": {"L_z": 0.04}}):
+        changed = [dataclasses.replace(found.trials[0], **worse), *found.trials[1:]]
+        (advice, *_) = recommendations(dataclasses.replace(found, trials=changed))
+        assert "rk4 at 0.01 s" not in advice
+
+
 @pytest.mark.parametrize(("next_step", "step", "limit"), [("diverges", 4e-3, "kept from its longest stable step"),
                                                           ((0.5,) * 3, 5e-3, "")])  # fmt: skip
 def test_no_step_at_the_edge_of_stability_is_recommended(next_step, step, limit):

@@ -163,8 +163,8 @@ def prepared(system, engine, box, before, after, room, h):
     return log_acceptance(box, system.model, after, room, h)
 
 
-def gas(count, thermostat, box_for):
-    """Volumes of an ideal gas in units of kT/p, every 40 steps."""
+def gas(count, thermostat, box_for, samples=800, steps=30):
+    """Volumes of an ideal gas in units of kT/p, every `steps` steps."""
     site = {"name": "A", "element": "Ar", "sigma_A": 0.005, "epsilon_kJ_mol": 1e-6, "mass_u": 40.0,
             "position_A": [0.0, 0.0, 0.0]}  # fmt: skip
     scene = Scene.from_dict({
@@ -182,8 +182,8 @@ def gas(count, thermostat, box_for):
     engine = system.engine()
     state = engine.begin(system.state, row)
     found = []
-    for _ in range(800):
-        move(engine, state, row, 0.005, 30)
+    for _ in range(samples):
+        move(engine, state, row, 0.005, steps)
         found.append(state.volume * pressure / THERMAL)
     return np.array(found), engine.moves
 
@@ -215,6 +215,28 @@ def test_an_ideal_gas_has_its_volumes(barostat, thermostat):
         :: max(1, round(len(volumes) * error**2 / volumes.var()))
     ]  # about as far as the correlation reaches
     assert stats.kstest(apart, "gamma", args=(n + 1,)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("n", "samples"), [(1, 300), (2, 300), pytest.param(1, 20000, marks=pytest.mark.soak),
+                                            pytest.param(2, 20000, marks=pytest.mark.soak)])  # fmt: skip
+def test_a_box_with_one_or_two_molecules_has_its_volumes(n, samples):
+    """Moves of the volume by up to 1.8 volumes of one molecule: those to no volume are rejected. A proposal that is
+    changed to a possible one would have no reverse."""
+
+    def box_for(asked, pressure):
+        width = 2 * np.sqrt(n + 1) * THERMAL / pressure
+        return VolumeMoves(constant_ramp(THERMAL), asked, width, float(n), (0.0, 0.0), key_of(3, BAROSTAT))
+
+    volumes, moves = gas(n, "langevin", box_for, samples, 2)
+    assert moves[1] < moves[0]
+    ratio = volumes[1:] / volumes[:-1]
+    assert ((ratio > 0.1) & (ratio < 10.0)).all()
+    assert not np.isclose(ratio, 0.1, rtol=1e-9).any()
+    assert ratio.min() < 0.3  # close to the limit
+    if samples > 1000:
+        assert stats.kstest(volumes[::40], "gamma", args=(n + 1,)).pvalue > 1e-3
+        blocks = volumes.reshape(40, -1).mean(axis=1)
+        assert abs(volumes.mean() - (n + 1)) < 4 * blocks.std(ddof=1) / np.sqrt(len(blocks))
 
 
 def test_a_rejected_move_leaves_no_trace(liquid):

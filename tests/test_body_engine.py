@@ -747,3 +747,27 @@ def test_a_stone_let_go_in_a_stiff_fluid_falls_at_its_terminal_speed():
         Scene.from_dict(stone | {"output": {"trajectory": False, "figures": False, "interval_s": 0.5}})
     ).run()
     assert results["vz"][1:] == pytest.approx(-np.sqrt(9.81 / 1e8), rel=1e-9)
+
+
+def drag(pose):
+    return -0.3 * pose.velocity, [0, 0, 0]
+
+
+def gyroscopic(pose):
+    return [0, 0, 0], np.cross([0.2, 0.1, 0.4], pose.angular_velocity_body)
+
+
+def pulled(pose):
+    return [np.sin(pose.time), 0, 0], 0.1 * pose.rotation[2]
+
+
+@pytest.mark.parametrize("start", [FREE["start"], {"position_m": [0.0, 0.0, 0.0]}])
+def test_functions_that_depend_on_velocities_are_noted(start):
+    """At rest too; not those of the pose, and not with a solver of the textbook equations."""
+    data = FREE | {"start": start}
+    simulation = Simulation(Scene.from_dict(data), applied={"drag": drag, "spin": gyroscopic, "pull": pulled})
+    assert simulation.system.velocity_dependent_functions() == ["drag", "spin"]
+    notes = simulation.run().summary["notes"]
+    assert any("drag and spin" in note and "order 1" in note and "dop853" in note for note in notes)
+    notes = simulate(data, {"drag": drag}, run__integrator="dop853").summary["notes"]
+    assert not any("order 1" in note for note in notes)

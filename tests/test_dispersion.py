@@ -166,6 +166,20 @@ def test_forces_are_as_accurate_as_asked_for(asked, method, box):
     assert 0.5 * asked < measured < 2 * asked
 
 
+@pytest.mark.parametrize("asked", [5e-5, 1e-4])
+@pytest.mark.parametrize(
+    "box", [{"lengths_A": 18.0}, {"lengths_A": 40.0}, {"lengths_A": [18.0, 17.0, 16.0], "vacuum_A": 30.0}]
+)
+def test_the_note_has_the_error_that_was_asked_for(asked, box):
+    """In a liquid, in a dilute box, of which a part is filled, and in a slab."""
+    forces = {"cutoff_A": 7.9, "truncation": "shift", "dispersion": "ewald", "dispersion_accuracy": asked}
+    system, _, _ = mixture(forces, box, molecules=[{"model": "argon", "count": 90}])
+    (argon,) = system.species
+    (note,) = [note for note in system.notes if "estimated rms error of its force" in note]
+    expected = asked * 24 * argon.epsilon[0] / argon.sigma[0] / KJ_PER_MOL
+    assert float(note.split(": ")[-1].split()[0]) == pytest.approx(expected, rel=0.02)
+
+
 def test_defaults_are_written_and_resolve_to_themselves():
     scene = small_scene({"spce": 64}, 18.6, forces={"cutoff_A": 8.0, "truncation": "shift", "dispersion": "pme"})
     resolved = rigidmd.resolve(scene)

@@ -28,6 +28,7 @@ from support import (
     write_openmm,
 )
 
+from rigidmd.engines.openmm.system import Group, integration_groups
 from rigidmd.errors import SceneError
 
 COUNTS = {"spce": 6, "nitrogen": 4}
@@ -252,12 +253,35 @@ def test_openmm_has_the_energy_of_the_tail_at_its_volume(tmp_path):
     write_openmm(tmp_path, own, own.system.state)
     whole = mm.XmlSerializer.deserialize((tmp_path / "system.xml").read_text())
     (tail,) = [force for force in whole.getForces() if isinstance(force, mm.CustomVolumeForce)]
-    strength, volume = tail.getEnergyFunction().split("/")
-    assert volume == "v"
+    strength, rest = tail.getEnergyFunction().split("/v+")
+    constant = float(rest.strip("()"))
+    assert constant > 1e-3  # of sites of one molecule, with shifted energies
     for edge in (13.0, 14.0):  # Å
         expected = own.system.tail.energy(edge**3) / 100  # u Å²/ps² in kJ/mol
         assert expected < -0.1
-        assert float(strength) / (edge / 10) ** 3 == pytest.approx(expected, rel=1e-9)
+        assert float(strength) / (edge / 10) ** 3 + constant == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("charges", [
+    {"electrostatics": "reaction_field", "reaction_field_truncation": "plain"},
+    {"electrostatics": "pme", "ewald_truncation": "plain", "ewald_accuracy": 1e-4},
+])  # fmt: skip
+def test_openmm_compares_continuous_energies_for_its_barostat(charges, tmp_path):
+    """Forces move molecules; a barostat compares all energies of the system, with steps at cutoffs and the tail."""
+    mm = pytest.importorskip("openmm")
+    forces = {"cutoff_A": 5.0, "truncation": "plain", "tail_correction": True} | charges
+    groups = []
+    for stage in (NVT | LANGEVIN, NPT | LANGEVIN | {"barostat": "monte_carlo"}):
+        view = drawn(stage, engine={"name": "openmm"}, forces=forces)
+        groups.append(integration_groups(view.scene.stages[0]))
+    write_openmm(tmp_path, view, view.system.state)
+    whole = mm.XmlSerializer.deserialize((tmp_path / "system.xml").read_text())
+    present = {force.getForceGroup() for force in whole.getForces()}
+    steps = {Group.STEP_LENNARD_JONES, Group.STEP_COULOMB, Group.TAIL}
+    assert steps <= present
+    assert groups[0] == {Group.LENNARD_JONES, Group.COULOMB_PAIRS, Group.RECIPROCAL}
+    assert groups[1] == groups[0] | steps
+    assert present <= groups[1]
 
 
 def test_openmm_has_an_integrator_for_each_stage(tmp_path):

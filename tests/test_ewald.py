@@ -769,6 +769,21 @@ def test_forces_are_as_accurate_as_asked_for(method, asked):
     )
 
 
+@pytest.mark.parametrize(
+    ("asked", "method"), [(1e-4, "pme"), (1e-5, "ewald"), pytest.param(1e-6, "pme", marks=pytest.mark.soak)]
+)
+def test_forces_of_a_slab_are_as_accurate_as_asked_for(method, asked):
+    """The density of the liquid counts, not the mean of the box: also of one that has grown along its normal."""
+    box = {"lengths_A": [12.5, 12.5, 12.5], "vacuum_A": 37.5}
+    forces = {"cutoff_A": 6.2, "electrostatics": method, "ewald_accuracy": asked}
+    scene = small_scene({}, None, molecules=[{"model": "spce", "count": 64}], box=box, forces=forces)
+    system, _, state = shaken(build(scene), 7)
+    found = coulomb_errors(system, state)
+    assert 0.5 * asked < found["in_e2_per_A2"] < 2 * asked
+    assert found["estimated_per_A"] == pytest.approx(found["rms_error_per_A"], rel=0.6)
+    assert estimated_error(system, state.cell) == pytest.approx(system.force_error, rel=1e-9)
+
+
 @pytest.mark.parametrize("method", ["ewald", "pme"])
 def test_a_box_that_has_outgrown_its_waves_is_noted(method):
     forces = {"cutoff_A": 7.7, "electrostatics": method}

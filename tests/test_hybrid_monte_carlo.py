@@ -11,6 +11,7 @@ from rigidmd.units import BOLTZMANN
 
 HYBRID = {"ensemble": "nvt", "temperature_K": 120.0, "thermostat": "hybrid_monte_carlo"}
 KEPT = {"momentum_refreshment": 1e-20}
+GRADIENT = next(name for name, scheme in SCHEMES.items() if scheme.has_gradient)
 MIXTURE = {"argon": 6, "nitrogen_trappe": 6, "spce": 6}  # points, linear and asymmetric bodies
 
 
@@ -121,6 +122,51 @@ def test_fields_that_depend_on_time_are_refused():
                 {"spce": 4}, 12.0, stages=[HYBRID | {"duration_ps": 1.0}], fields=field, forces={"cutoff_A": 5.0}
             )
         )
+
+
+@pytest.mark.parametrize("name", ["velocity_verlet", "position_verlet", GRADIENT])
+def test_a_trajectory_that_diverges_is_rejected(name):
+    """Its step throws molecules out of all numbers. The run goes on from the start of the trajectory, a rejection is no
+    drift, and a note tells of few trajectories too."""
+    stage = {"integrator": name, "timestep_fs": 3000.0, "trajectory_steps": 4, "duration_ps": 48.0}
+    watch = {"move": False, "energy": False, "kick": False, "turn_rad": False}
+    results, simulation = sampled(stage, {"nitrogen_trappe": 12, "argon": 4}, 13.0, 12.0, watch=watch)
+    start = Simulation(simulation.scene)
+    start.start()
+    assert np.array_equal(results.state.position, start.state.position)
+    assert results["acceptance"][1:].tolist() == [0.0] * 4
+    assert np.isfinite(results["abs_dH_kT"][1:]).all()
+    assert np.abs(results["drift"]).max() < 1e-9 * np.abs(results["energy"]).max()
+    assert any("0.0% of the trajectories were accepted" in note for note in results.summary["notes"])
+    assert results.summary["stages"][0]["trajectories"] == 4
+
+
+def test_every_metropolis_test_has_its_own_random_number():
+    """Of many tests of the same trajectory, with the same dH, a fraction exp(-dH/kT) is accepted."""
+    stages = [HYBRID | {"timestep_fs": 40.0, "trajectory_steps": 5, "duration_ps": 1.0} | KEPT]
+    system, engine, state = built(MIXTURE, 12.0, forces={"cutoff_A": 5.0}, stages=stages)
+    scheme = integrator_of_stage(system, 0)
+    now = engine.begin(state, scheme)
+    thermal = np.sqrt(BOLTZMANN * 120.0 * system.model.inverse_mass[system.model.species])
+    now.velocity[:] = thermal[:, None] * np.random.default_rng(2).standard_normal(now.velocity.shape)
+    engine.advance(now, scheme, 0.002, 500)
+    kept, steps = now.copy(), 500
+
+    def again(dt):
+        """The chance of the trajectory from the kept state, and whether it was accepted this time."""
+        nonlocal steps
+        for name in ("position", "rotation", "velocity", "angular_momentum_body"):
+            getattr(now, name)[:] = getattr(kept, name)
+        engine.forget()
+        before, steps = engine.trajectories, steps + 5
+        engine.advance(now, scheme, dt, steps, observed=True)
+        _, accepted, _, chance, _ = engine.trajectories - before
+        return chance, accepted
+
+    dt = next(dt for dt in np.arange(0.003, 0.02, 0.0005).tolist() if 0.2 < again(dt)[0] < 0.8)
+    chances, outcomes = np.transpose([again(dt) for _ in range(60)])
+    assert np.ptp(chances) < 1e-6
+    assert abs(outcomes.mean() - chances[0]) < 4 * np.sqrt(chances[0] * (1 - chances[0]) / 60)
 
 
 def test_few_accepted_trajectories_are_noted():

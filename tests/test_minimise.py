@@ -31,6 +31,7 @@ from support import (
 )
 
 from rigidmd.commands.cli import main
+from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
@@ -615,3 +616,26 @@ def test_structures_that_overlap_may_be_minimised(tmp_path):
     assert found["converged"]
     assert any("overlap" in note for note in results.summary["notes"])
     assert np.linalg.norm(np.diff(results.state.position, axis=0)) == pytest.approx(2 ** (1 / 6) * 3.405, rel=1e-3)
+
+
+def test_compiling_is_not_minimising(monkeypatch):
+    """The first forces in double precision, which may compile for a minute, come before the clock of the stage."""
+    from rigidmd.run import molecular
+
+    order = []
+    evaluate, minimise_stage = CpuEngine.evaluate, molecular.minimise
+
+    def evaluate_and_record(engine, state):
+        order.append(f"forces in {engine._setup.dtype.__name__}")
+        return evaluate(engine, state)
+
+    def minimise_and_record(*arguments):
+        order.append("minimise")
+        return minimise_stage(*arguments)
+
+    monkeypatch.setattr(CpuEngine, "evaluate", evaluate_and_record)
+    monkeypatch.setattr(molecular, "minimise", minimise_and_record)
+    stages = [stage_of(most_iterations=2), {"duration_ps": 0.002}, stage_of(most_iterations=2)]
+    Simulation(small_scene({"argon": 20}, 20.0, stages=stages, precision="mixed"), warn=str).run()
+    assert order.count("minimise") == 2
+    assert "forces in float64" in order[: order.index("minimise")]

@@ -3,14 +3,17 @@
 Everything on the other side is written out here: sums over all pairs and images, constants from SI.
 """
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
+from reference import inverse_power
 from scipy.spatial.transform import Rotation
 from support import (
     RigidFrames,
     build,
+    built,
     density_profile,
     dielectric,
     hydrogen_bonds,
@@ -21,6 +24,8 @@ from support import (
     spectrum,
     structure_factor,
 )
+
+from rigidmd.engines.external import compare_at
 
 GRAM_PER_CM3 = 1 / 1.66053906660  # u/Å³
 KELVIN = 1.380649e-23 / 1.66053906660e-27 * 1e20 / 1e24  # u Å²/ps²
@@ -332,3 +337,79 @@ def test_the_tail_of_a_mixture_is_a_sum_over_all_pairs_of_its_sites(mixing):
         pressure += 2 * np.pi / (3 * volume**2) * (12 * twelve / (9 * cutoff**9) - 6 * six / (3 * cutoff**3))
     assert system.tail.energy(volume) == pytest.approx(energy, rel=1e-9)
     assert system.tail.pressure(volume) == pytest.approx(pressure, rel=1e-9)
+
+
+@pytest.mark.parametrize("cutoff", [5.5, 6.4])
+@pytest.mark.parametrize("truncation", ["plain", "shift", "force_shift", "force_switch", "switch", "smooth_switch"])
+def test_the_tail_leaves_out_pairs_of_sites_of_one_molecule(truncation, cutoff):
+    """A molecule is part of the uniform liquid and not among its own neighbours: U has less by half the sum, over its
+    pairs of sites and each site with itself, of what the truncation removes from them. No force, and no pressure."""
+    counts, edge = {"argon": 5, "co2_trappe": 4, "benzene_opls": 3}, 20.0
+    forces = {"cutoff_A": cutoff, "truncation": truncation, "tail_correction": True}
+    system = build(small_scene(counts, edge, forces=forces))
+    start = system.scene.forces.switch_start_A or cutoff
+    less = 0.0
+    for molecule, count in zip(system.species, counts.values(), strict=True):
+        for i, j in product(range(len(molecule.masses)), repeat=2):
+            r = np.linalg.norm(molecule.positions_body[i] - molecule.positions_body[j])
+            sigma = (molecule.sigma[i] + molecule.sigma[j]) / 2
+            strength = 4 * np.sqrt(molecule.epsilon[i] * molecule.epsilon[j])
+            for sign, p in ((1, 12), (-1, 6)):
+                less += count * sign * strength * sigma**p * removed_power(r, p, cutoff, start, truncation) / 2
+    constant = system.tail.energy(edge**3) - system.tail.energy_volume / edge**3
+    assert constant == pytest.approx(-less, rel=1e-5, abs=1e-9)
+    assert constant > 0.5 or truncation not in ("shift", "force_shift", "force_switch")
+
+
+def removed_power(r, p, cutoff, start, truncation):
+    """What a truncation removes from r⁻ᵖ at a distance, also at 0: there it is that of 1.5 Å, but for a slope."""
+    if r == 0 and truncation == "force_shift":
+        return (1 + p) * cutoff**-p
+    r = r or 1.5
+    return r**-p - inverse_power(np.array([r]), p, cutoff, start, truncation)[0]
+
+
+@pytest.mark.parametrize(("name", "edge"), [("argon", 5.3), ("co2_trappe", 5.7)])
+def test_the_tail_gives_the_energy_of_a_crystal(name, edge):
+    """Crystals with four molecules along the diagonals of a cube. The sum over all neighbours of each molecule,
+    truncated and corrected, has on average over cutoffs the energy of the whole crystal: the density of neighbours is
+    uniform but for the molecule itself."""
+    (molecule,) = build(small_scene({name: 4}, 40.0)).species
+    diagonals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    along = np.ptp(molecule.positions_body, axis=0).argmax()
+    offsets = molecule.positions_body[:, along]
+    centres = edge * np.array([[0, 0, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
+    grid, reach = np.arange(-7, 8), 35.0
+    cells = edge * np.array(list(product(grid, repeat=3)))
+    pairs = []  # (sigma, 4 epsilon, sorted distances)
+    for i, j, k in product(range(len(offsets)), range(len(offsets)), range(4)):
+        between = centres[k] + offsets[j] * diagonals[k] - offsets[i] * diagonals[0] + cells
+        distance = np.linalg.norm(between[np.any(cells != 0, axis=1) | (k != 0)], axis=1)
+        sigma = (molecule.sigma[i] + molecule.sigma[j]) / 2
+        pairs.append((sigma, 4 * np.sqrt(molecule.epsilon[i] * molecule.epsilon[j]), distance[distance < reach]))
+    density = 4 / edge**3
+
+    def v(sigma, strength, r):
+        return strength * ((sigma / r) ** 12 - (sigma / r) ** 6)
+
+    whole = sum(v(*kind, r).sum() / 2 for *kind, r in pairs)
+    whole -= sum(2 * np.pi * density * strength * sigma**6 / 3 / reach**3 for sigma, strength, _ in pairs) / 4
+    errors, less = [], []
+    for cutoff in np.linspace(9.0, 14.0, 26).tolist():
+        forces = {"cutoff_A": cutoff, "truncation": "shift", "tail_correction": True}
+        tail = build(small_scene({name: 4}, 40.0, forces=forces)).tail
+        within = sum((v(*kind, r[r < cutoff]) - v(*kind, cutoff)).sum() / 2 for *kind, r in pairs)
+        errors.append(within + (tail.energy_volume * density / 4 + tail.constant) / 4 - whole)
+        less.append(tail.constant / 4)
+    assert abs(np.mean(errors)) < 0.15 * np.mean(less)
+
+
+def test_the_tail_of_another_engine_is_another_number():
+    """Of formulas that other programs evaluate: a wrong tail correction does not agree with itself."""
+    forces = {"cutoff_A": 5.5, "truncation": "shift", "tail_correction": True}
+    system, engine, state = built(COUNTS, 16.0, forces=forces)
+    assert all(line.agrees for line in compare_at(system, state, engine, engine))
+    for wrong in ({"constant": 0.0}, {"energy_volume": 0.99 * system.tail.energy_volume}):
+        other = replace(system, tail=system.tail._replace(**wrong))
+        differ = [line.name for line in compare_at(other, state, engine, engine) if not line.agrees]
+        assert "lennard jones tail" in differ and "potential energy" in differ

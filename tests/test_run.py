@@ -243,6 +243,33 @@ ASKED = {
 }
 
 
+@pytest.mark.parametrize("speed", [0.4, 1.0])
+def test_the_energy_of_a_removed_momentum_is_in_the_summary(speed):
+    """P²/2M of what is removed, as a positive number; only where something is removed is there a sentence."""
+    stages = [{"duration_ps": 0.04, "timestep_fs": 4.0}, {"duration_ps": 0.04, "timestep_fs": 4.0}]
+    sections = {"stages": stages, "run": {"remove_momentum_interval_ps": 0.031}, "output": {"trajectory": False}}
+    simulation = Simulation(small_scene({"argon": 20}, 20.0, **sections), warn=str)
+    system, state = simulation.system, simulation.state.copy()
+    state.velocity[:] += [speed, -0.5 * speed, 0.2]
+    simulation.start_from(state)
+    mass = system.model.mass[system.model.species]
+    momentum = mass @ state.velocity
+    removed = simulation.run().summary["momentum_removed"]
+    assert removed["energy_kJ_mol"] == pytest.approx(momentum @ momentum / (2 * mass.sum()) / KJ_PER_MOL, rel=1e-9)
+    assert any("remove_momentum_interval_ps" in note for note in system.notes)
+    for thermostat in ("langevin", "hybrid_monte_carlo"):
+        stage = {
+            "ensemble": "nvt",
+            "temperature_K": 90.0,
+            "thermostat": thermostat,
+            "duration_ps": 0.04,
+            "timestep_fs": 4.0,
+        }
+        scene = small_scene({"argon": 20}, 20.0, **sections | {"stages": [stage]})
+        assert not any("remove_momentum_interval_ps" in note for note in scene.rounded_times())
+        assert "total momentum: removed" not in describe(scene)
+
+
 def test_intervals_that_are_not_whole_steps_are_noted():
     stages = [
         {"duration_ps": 0.016, "timestep_fs": 4.0},

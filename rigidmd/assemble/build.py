@@ -247,7 +247,7 @@ def barostat_of(system: System, k: int) -> NamedTuple:
     x, y, z = map(float, system.model.keeps_momentum & system.keeps_momentum_in(k))
     given = Confinement(
         _thermal(stage), pressure, stage.compressibility / BAR, system.state.volume, float(mobile(system.model).sum()),
-        (x, y, z), tuple(system.tail or (0.0, 0.0)), key,
+        (x, y, z), (0.0, 0.0) if system.tail is None else system.tail[:2], key,
     )  # fmt: skip
     return BAROSTATS[stage.barostat_kind](stage, given)
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from rigidmd.core.integrators import RK4, SOLVERS
-from rigidmd.forces.neighbors.space import Triclinic, cell_of
+from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
 from rigidmd.forces.potentials.truncation import default_switch_start
 from rigidmd.io.formats import BODY_TOPOLOGY, TOPOLOGY
@@ -160,9 +160,7 @@ def is_homogeneous(composition: Composition) -> bool:
     space, position = composition.space, composition.position
     if space.volume == inf:
         return False
-    fraction = np.sort(position @ np.linalg.inv(cell_of(space)) % 1.0, axis=0)
-    gap = np.diff(fraction, axis=0, append=fraction[:1] + 1.0).max(axis=0) * space.edges
-    return bool(gap.max() <= 2 * (space.volume / len(position)) ** (1 / 3))
+    return bool(longest_gaps(space, position).max() <= 2 * (space.volume / len(position)) ** (1 / 3))
 
 
 def electrostatics_module(forces: Forces) -> ModuleType | None:

@@ -31,6 +31,9 @@ COUPLINGS = {
 }
 #: Largest change of the volume in a Monte Carlo move, in standard deviations of its fluctuations.
 WIDTH = 2.0
+#: Largest factor of the volume in a Monte Carlo move, and of its inverse. Boxes of one or two
+#: molecules draw larger ones.
+LARGEST_FACTOR = 10.0
 #: Largest drift of a move, as a strain; noise is added to it. It limits the effect of a bad start in one move.
 LONGEST_DRIFT = 0.01
 
@@ -221,7 +224,9 @@ def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw)
             if status != OK:
                 return status
             progress[1] = 1
-        propose_strain(barostat, model, state, workspace, h, draw)
+        if not propose_strain(barostat, model, state, workspace, h, draw):
+            workspace.counts[0] += 1
+            return OK
         copy_moved(state, load, workspace, workspace.load, workspace.tally[0], workspace.tally[1])
         apply_strain(barostat, state, workspace)
         progress[2] = 1
@@ -249,18 +254,23 @@ def target_pressure(pressure, state, k):
 
 
 def propose_strain(barostat, model, state, workspace, h, draw):
-    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse."""
+    """Draw the strain of a move into workspace.strain, with its drift and variance, and set T and its inverse. Returns
+    whether the move is possible; one that is not counts as rejected."""
     raise TypeError("compiled code only")
 
 
 @implements(propose_strain, VolumeMoves)
 def propose_volume(barostat, model, state, workspace, h, draw):
     u, _ = uniforms(barostat.key, draw, 0, state.step[NOW])
-    volume = volume_of(state.cell)
+    factor = 1 + (2 * u - 1) * barostat.width / volume_of(state.cell)
+    # Also for the reverse move: a volume that one move reaches has to be as easy to leave by one.
+    if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:
+        return False
     workspace.strain[0] = 0.0
     for k in range(3):
-        workspace.strain[0, k] = log(max(1 + (2 * u - 1) * barostat.width / volume, 0.1)) / 3
+        workspace.strain[0, k] = log(factor) / 3
     set_matrices(workspace)
+    return True
 
 
 @implements(propose_strain, CellRescaling)
@@ -272,6 +282,7 @@ def propose_rescaling(barostat, model, state, workspace, h, draw):
             if barostat.coordinate[k] == c:
                 workspace.strain[0, k] = workspace.strain[1, k] + sqrt(workspace.strain[2, k]) * xi
     set_matrices(workspace)
+    return True
 
 
 @kernel

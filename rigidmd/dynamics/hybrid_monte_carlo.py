@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
-from rigidmd.core.state import HEAT, NOW, OK, Load, State, no_load
+from rigidmd.core.state import BEHIND_WALL, HEAT, NOT_FINITE, NOW, OK, Load, State, no_load
 from rigidmd.dynamics.noise import uniforms
 from rigidmd.dynamics.thermostats import HybridMonteCarlo, kinetic_energies_of, ramp_value
 from rigidmd.forces.terms import WITH_ENERGIES, compute_load, copy
@@ -20,7 +20,8 @@ from rigidmd.forces.terms import WITH_ENERGIES, compute_load, copy
 #: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)),
 #: and of exp(-dH/kT), whose mean is 1 in equilibrium.
 ENDED, ACCEPTED, SIZES, CHANCES, WEIGHTS = range(5)
-#: Largest -dH/kT in `WEIGHTS`, so that sums stay finite where energies fall from a bad start.
+#: Largest abs(dH)/kT in `SIZES` and -dH/kT in `WEIGHTS`, so that sums stay finite where a trajectory diverges and where
+#: energies fall from a bad start.
 LARGEST = 600.0
 
 
@@ -34,12 +35,14 @@ class TrajectoryWorkspace(NamedTuple):
     load: Load
     energies: np.ndarray  # (2,) potential, without constants, and kinetic, u Å²/ps²
     known: np.ndarray  # (1,) whether the potential energy belongs to the present positions
+    diverged: np.ndarray  # (1,) whether the present trajectory has diverged, so that it rests at its start
     sums: np.ndarray  # (5,) see ENDED
 
 
 def trajectory_workspace(state: State) -> TrajectoryWorkspace:
     arrays = (array.copy() for array in state[:4])
-    return TrajectoryWorkspace(*arrays, no_load(state), np.zeros(2), np.zeros(1, np.int64), np.zeros(5))
+    known, diverged = np.zeros((2, 1), np.int64)
+    return TrajectoryWorkspace(*arrays, no_load(state), np.zeros(2), known, diverged, np.zeros(5))
 
 
 @kernel
@@ -79,7 +82,9 @@ def _start_or_test(
     potential = workspace.energies[0]
     if not starts or workspace.known[0] == 0 or progress[1] != 1:
         status, potential = potential_energy(terms, state, load, progress)
-        if status != OK:
+        if not starts and diverges(workspace, status):
+            rest_at_start(workspace, state, load)
+        elif status != OK:
             return status
     moving, turning = kinetic_energies_of(model, code, state, blocks)
     kinetic = moving + turning
@@ -89,15 +94,15 @@ def _start_or_test(
         return OK
     gained = potential - workspace.energies[0] + (kinetic - workspace.energies[1])
     loss = gained / ramp_value(thermostat.thermal_energy, state)
-    if isnan(loss):
+    if isnan(loss) or workspace.diverged[0] != 0:
         loss = inf
     u, _ = uniforms(thermostat.key, draw, 0, state.step[NOW])
     sums = workspace.sums
     sums[ENDED] += 1
-    sums[SIZES] += abs(loss)
+    sums[SIZES] += min(LARGEST, abs(loss))
     sums[CHANCES] += exp(min(0.0, -loss))
     sums[WEIGHTS] += exp(min(LARGEST, -loss))
-    workspace.known[0] = 1
+    workspace.known[0], workspace.diverged[0] = 1, 0
     if log(u) < -loss:
         sums[ACCEPTED] += 1
         workspace.energies[0] = potential
@@ -110,6 +115,43 @@ def _start_or_test(
         if barostat_workspace is not None:
             barostat_workspace.known[0] = 0
     return OK
+
+
+@chosen_by_type
+def rest_if_diverged(workspace, state, load, progress, status):
+    """The status code of an evaluation of forces. In a trajectory, NOT_FINITE and BEHIND_WALL become OK: it diverges,
+    and rests at its start, with the forces there unknown, until it is rejected."""
+    if not is_a(workspace, TrajectoryWorkspace):
+        return lambda workspace, state, load, progress, status: status
+
+    def rest(workspace, state, load, progress, status):
+        if not diverges(workspace, status):
+            return status
+        rest_at_start(workspace, state, load)
+        progress[1] = 0
+        return OK
+
+    return rest
+
+
+@kernel
+def diverges(workspace, status):
+    """Whether a status code is the first sign that a trajectory has diverged."""
+    return status in (NOT_FINITE, BEHIND_WALL) and workspace.diverged[0] == 0
+
+
+@kernel
+def rest_at_start(workspace, state, load):
+    workspace.diverged[0] = 1
+    copy_start(workspace, workspace.load, state, load)
+
+
+@chosen_by_type(inline=True)
+def time_moved(workspace, h):
+    """The time of a kick or a drift: h, or 0 while a diverged trajectory rests."""
+    if not is_a(workspace, TrajectoryWorkspace):
+        return lambda workspace, h: h
+    return lambda workspace, h: 0.0 if workspace.diverged[0] != 0 else h
 
 
 @chosen_by_type

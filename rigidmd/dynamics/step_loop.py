@@ -14,7 +14,9 @@ from rigidmd.core.integrators import (
 from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
 from rigidmd.dynamics.barostats import apply_barostat, compute_step_load, scale_box
 from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
-from rigidmd.dynamics.hybrid_monte_carlo import know_potential, start_or_test_trajectory
+from rigidmd.dynamics.hybrid_monte_carlo import (
+    know_potential, rest_if_diverged, start_or_test_trajectory, time_moved,
+)  # fmt: skip
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
 from rigidmd.dynamics.thermostats import apply_thermostat, thermostat_code
@@ -95,27 +97,30 @@ def advance(
             h = flows.fraction[k] * dt
             if flows.kind[k] == KICK:
                 if gradient_workspace is None:
-                    if progress[1] == 0:
+                    while progress[1] == 0:
                         now = state.step[NOW] + 1
                         needed = (observed and now == until) or is_tested(flows, now - state.step[ORIGIN])
                         which = WITH_ENERGIES if needed and k > flows.last else FORCES_ONLY
                         status = compute_step_load(barostat, terms, state, load, barostat_workspace, flows, which)
+                        progress[1] = 1 if status == OK else 0
+                        status = rest_if_diverged(trajectory_workspace, state, load, progress, status)
                         if status != OK:
                             return status
-                        progress[1] = 1
                 else:
                     while progress[1] < (1 if flows.gradient[k] == 0.0 else 2):
                         pending = apply_pending_kicks(model, code, state, load, pending)
                         tau, known = flows.gradient[k] * dt * dt, progress[1] == 1
                         status = evaluate(model, state, load, terms, gradient_workspace, tau, known)
+                        progress[1] += status == OK
+                        status = rest_if_diverged(trajectory_workspace, state, load, progress, status)
                         if status != OK:
                             return status
-                        progress[1] += 1
+                h = time_moved(trajectory_workspace, h)
                 accumulate_work(model, terms, state, 0.5 * h)
                 pending = kick(model, code, state, load, pending, h)
                 accumulate_work(model, terms, state, 0.5 * h)
             elif flows.kind[k] == DRIFT:
-                drift(model, code, state, load, pending, h)
+                drift(model, code, state, load, pending, time_moved(trajectory_workspace, h))
                 pending = NO_PENDING_KICKS
                 state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
                 progress[1] = 0

@@ -136,6 +136,29 @@ class BodySystem:
         terms = {name: _piece(term, time) for name, term in self.terms.items()}
         return Body._make(_piece(part, time) for part in self.body), terms
 
+    def velocity_dependent_functions(self) -> list[str]:
+        """Names of the functions in `applied` that give another force or torque at the start with other velocities, but
+        the same one with the same."""
+        start = self.pose(0.0, self.state)
+        reach = float(np.linalg.norm(self.points, axis=1).max()) or 1.0
+        rate = 1.0 / self.scene.run.duration_s
+        along = np.array([1.0, -0.7, 0.4])
+        velocity = 1.3 * start.velocity + rate * reach * along if self.translates else start.velocity
+        spin = 1.3 * start.angular_velocity_body + rate * along[::-1] if self.rotates else start.angular_velocity_body
+        other = start._replace(velocity=velocity, angular_velocity_body=spin)
+        found = []
+        for name, function in self.applied.items():
+            try:
+                one, again, moved = (
+                    np.concatenate([np.asarray(part, float).reshape(3) for part in function(pose)])
+                    for pose in (start, start, other)
+                )
+            except (Exception, SystemExit):  # user code may raise anything; the run reports it
+                continue
+            if np.array_equal(one, again) and not np.array_equal(one, moved):
+                found.append(name)
+        return found
+
     def _load_function(self, function: Callable[[Pose], tuple]) -> Callable[[float, State], tuple]:
         """A user's function of a pose as a function of time and state that returns force and torque, checked."""
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import NOW, ORIGIN, State
-from rigidmd.engines.force_field import ForceFieldView, force_field_of, unknown_terms
+from rigidmd.engines.force_field import ForceFieldView, force_field_of, tail_of_formulas, unknown_terms
 from rigidmd.engines.observables import kinetic_energies, observe
 from rigidmd.engines.protocol import Engine, keep_time
 from rigidmd.engines.registry import Program
@@ -183,6 +183,8 @@ def check_engine(system: System) -> str:
 #: Tolerance of pair sums, relative to their size: engines have slightly different constants, such as 332.06371.
 #: Energies of OpenMM in single precision differ by up to 3e-7.
 PLAIN = 1e-6
+#: Component of an observation that engines take from the system, so that it is compared with another value.
+TAIL = "lennard_jones_tail"
 #: Ratio of virial and energy of a 1/r¹² term. The energy may be smaller, where attraction cancels repulsion.
 STEEPEST = 12
 #: Tolerance of forces with an Ewald sum, in estimated errors. Each engine has such an error.
@@ -205,8 +207,14 @@ class Comparison(NamedTuple):
 
 
 def compare_at(system: System, state: State, here: Engine, there: Engine) -> list[Comparison]:
-    """Compare energies by term, forces and torques on bodies, and the virial of two engines at a state."""
+    """Compare energies by term, forces and torques on bodies, and the virial of two engines at a state. The tail
+    correction is compared with `tail_of_formulas`."""
     ours, theirs = (observe(system, engine, state, energy_unit=1.0) for engine in (here, there))
+    independent = {}  # instead of what both observations take from the system
+    if TAIL in theirs.components:
+        independent[TAIL] = tail_of_formulas(force_field_of(system), state.volume)
+    potential = theirs.potential + sum(value - theirs.components[name] for name, value in independent.items())
+    their_components = theirs.components | independent
     virial = sum(abs(float(tally.virial.trace())) for tally in here.evaluate(state)[1].values())
 
     kinetic = sum(kinetic_energies(system, state))
@@ -216,11 +224,11 @@ def compare_at(system: System, state: State, here: Engine, there: Engine) -> lis
     force_error, sites, alpha = system.force_error or 0.0, system.site_count, system.scene.forces.ewald_alpha_per_A
     ewald = force_error * (1 / alpha if alpha else 0.0) * (PER_SITE * sites + ERRORS * np.sqrt(sites))
     lines = []
-    for name in {**ours.components, **theirs.components}:
-        a, b = (seen.components.get(name, 0.0) for seen in (ours, theirs))
+    for name in {**ours.components, **their_components}:
+        a, b = (components.get(name, 0.0) for components in (ours.components, their_components))
         tolerance = PLAIN * size + (ewald if name.startswith("coulomb") else 0.0)
         lines.append(_energy(name.replace("_", " "), a, b, tolerance))
-    lines.append(_energy("potential energy", ours.potential, theirs.potential, PLAIN * size + ewald))
+    lines.append(_energy("potential energy", ours.potential, potential, PLAIN * size + ewald))
     each = np.sqrt(sites / len(system.model.species)) * ERRORS * force_error
     radius = max(m.radius for m in system.species)
     for name, unit, k, tolerance in (("force", "kJ/(mol Å)", 0, each), ("torque", "kJ/mol", 1, each * radius)):

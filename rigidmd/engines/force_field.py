@@ -5,8 +5,8 @@ terms that rigidmd itself runs, so that mixing rules, special pairs and truncati
 `unknown_terms` lists what no other program can express.
 """
 
-from collections.abc import Iterator
-from itertools import product
+from collections.abc import Callable, Iterator
+from itertools import combinations_with_replacement, pairwise, product
 from math import inf
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,8 +21,9 @@ from rigidmd.forces.parts import gather_per_molecule
 from rigidmd.forces.potentials.coulomb import ReactionField
 from rigidmd.forces.potentials.lennard_jones import LennardJones
 from rigidmd.forces.potentials.screened_coulomb import DampedShiftedForce, ScreenedCoulomb
-from rigidmd.forces.potentials.truncation import ForceShifted, SmoothlySwitched, Switched, Truncation
+from rigidmd.forces.potentials.truncation import ForceShifted, SmoothlySwitched, Switched, Truncation, Unmodified
 from rigidmd.scene import MolecularScene
+from rigidmd.scene.validation import not_none
 
 #: Classes of the pair potentials and terms that the view describes.
 DESCRIBED = (LennardJones, ReactionField, DampedShiftedForce, ScreenedCoulomb, EwaldSum, Pme, Background)
@@ -31,6 +32,8 @@ SWITCHES: dict[type, str] = {
     Switched: "1-10*t^3+15*t^4-6*t^5",
     SmoothlySwitched: "1-126*t^5+420*t^6-540*t^7+315*t^8-70*t^9",
 }
+#: In place of the distance 0 (Å) of a site from itself in formulas, which have 1/r there.
+CONTACT = 1e-9
 
 
 class SiteKind(NamedTuple):
@@ -195,16 +198,77 @@ def table(formula: str, first: float, last: float, entries: int) -> str:
     """A table for LAMMPS' pair style `table`, even in r² from `first` to `last` Å: number, r, energy, force."""
     import sympy  # slow to import
 
-    r = sympy.Symbol("r", positive=True)
-    text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
-    names: dict[str, Any] = {"r": r, "max": sympy.Max}
-    for definition in reversed(definitions):
-        name, _, value = definition.partition("=")
-        names[name] = sympy.parse_expr(value, names)
-    energy = sympy.parse_expr(text, names)
+    r, energy = _symbolic(formula)
     x = np.sqrt(np.linspace(first**2, last**2, entries))
     with np.errstate(all="ignore"):
         columns = [sympy.lambdify(r, y, ["numpy", "scipy"])(x) for y in (energy, -sympy.diff(energy, r))]
     rows = zip(x, *(np.broadcast_to(column, x.shape) for column in columns), strict=True)
     head = f"N {entries} RSQ {first:.17g} {last:.17g}\n\n"
     return head + "".join(f"{k} {x:.15g} {u:.15g} {f:.15g}\n" for k, (x, u, f) in enumerate(rows, 1))
+
+
+def _symbolic(formula: str) -> tuple[Any, Any]:
+    """The symbol r, and the expression of a formula."""
+    import sympy  # slow to import
+
+    r = sympy.Symbol("r", positive=True)
+    text, *definitions = (part.strip() for part in formula.replace("^", "**").split(";"))
+    names: dict[str, Any] = {"r": r, "max": sympy.Max}
+    for definition in reversed(definitions):
+        name, _, value = definition.partition("=")
+        names[name] = sympy.parse_expr(value, names)
+    return r, sympy.parse_expr(text, names)
+
+
+def tail_of_formulas(view: ForceFieldView, volume: float) -> float:
+    """The energy of the tail correction, u Å²/ps², by quadrature of the formulas that other programs evaluate.
+
+    It has no code in common with `lennard_jones.tail`, with which it is compared: programs have no correction for most
+    cutoff schemes, or one that counts sites of one molecule differently.
+    """
+    count, total = np.bincount(view.kind, minlength=len(view.kinds)), 0.0
+    for i, j in combinations_with_replacement(range(len(view.kinds)), 2):
+        if view.epsilon[i, j] == 0:
+            continue
+        integral, removed = _removed_by_truncation(view, float(view.sigma[i, j]), float(view.epsilon[i, j]))
+        orders = 1 if i == j else 2
+        total += orders * 2 * np.pi / volume * float(count[i] * count[j]) * integral
+        # sites of one molecule are not neighbours of each other
+        total -= orders / 2 * sum(removed(r) * n for r, n in _distances_in_molecules(view, i, j))
+    return total
+
+
+def _removed_by_truncation(
+    view: ForceFieldView, sigma: float, epsilon: float
+) -> tuple[float, Callable[[float], float]]:
+    """The integral of r² (v - truncated v) over all r, and v - truncated v as a function of r."""
+    import sympy  # slow to import
+    from scipy.integrate import quad
+
+    law = not_none(view.lennard_jones)
+    powers = 4 * epsilon * sigma**12, 4 * epsilon * sigma**6
+    nothing = (0.0,) * 4
+    unmodified = law._replace(truncation=Unmodified(inf), terms12=nothing, terms6=nothing)
+    r, whole = _symbolic(lennard_jones_formula(unmodified, *powers, 1.0))
+    # expanded, so that 1/r¹² cancels where it is not truncated
+    inside = sympy.lambdify(r, sympy.expand(whole - _symbolic(lennard_jones_formula(law, *powers, 1.0))[1]))
+    beyond = sympy.lambdify(r, whole)
+
+    def removed(distance: float) -> float:
+        return float(inside(max(distance, CONTACT)) if distance <= law.cutoff else beyond(distance))
+
+    start = law.cutoff if isinstance(law.truncation, Unmodified) else law.truncation.start
+    ends = sorted({0.0, float(start), float(law.cutoff)})
+    parts = [quad(lambda x: x**2 * removed(x), a, b)[0] for a, b in pairwise(ends)]
+    return sum(parts) + quad(lambda x: x**2 * beyond(x), law.cutoff, inf)[0], removed
+
+
+def _distances_in_molecules(view: ForceFieldView, i: int, j: int) -> Iterator[tuple[float, int]]:
+    """Distances (Å) of sites of the kinds i and j in one molecule, a site from itself included, and their numbers."""
+    species, sites = view.system.model.species, view.system.sites_per_molecule
+    first = np.cumsum(sites) - sites
+    for k, member, molecules in zip(*np.unique(species, return_index=True, return_counts=True), strict=True):
+        kind = view.kind[first[member] : first[member] + sites[member]]
+        position = view.system.species[k].positions_body
+        for a, b in product(position[kind == i], position[kind == j]):
+            yield float(np.linalg.norm(a - b)), int(molecules)

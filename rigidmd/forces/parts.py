@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.forces.ewald.errors import Charges, charges_in
+from rigidmd.forces.ewald.errors import FINE, Charges, charges_in, filled_fraction
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites, exclusion_groups, sites_of
 from rigidmd.forces.neighbors.space import Space
@@ -51,6 +51,11 @@ class SystemParts(NamedTuple):
         """Molecules of each species (species,)."""
         return np.bincount(self.model.species, minlength=len(self.species))
 
+    @property
+    def filled(self) -> float:
+        """See `errors.filled_fraction`."""
+        return filled_fraction(self.species, self.counts, self.space, self.state.position)
+
     def charged(self) -> tuple[BodySites | CentralSites, np.ndarray]:
         """The charged sites, and their charges (s,) in e."""
         charges = gather_per_molecule([m.charges[m.charges != 0] for m in self.species], self.model.species)
@@ -67,15 +72,45 @@ class SystemParts(NamedTuple):
         return total
 
 
-class Tail(NamedTuple):
-    """Tail correction: the energy and pressure beyond the cutoff, at any volume."""
+class InnerPairs(NamedTuple):
+    """Pairs of sites of one molecule: each pair in both orders, and each site with itself. Equal pairs are one row."""
 
-    energy_volume: float  # energy times the volume, u Å⁵/ps²
+    one: np.ndarray  # (p,) kind of a site
+    other: np.ndarray  # (p,) kind of the other
+    distance: np.ndarray  # (p,) Å
+    count: np.ndarray  # (p,) in the whole system
+
+    def between(self, i: int, j: int) -> "InnerPairs":
+        """The pairs of two kinds, in both orders."""
+        rows = ((self.one == i) & (self.other == j)) | ((self.one == j) & (self.other == i))
+        return InnerPairs(*(column[rows] for column in self))
+
+
+def inner_pairs(kinds: list[np.ndarray], positions: list[np.ndarray], counts: np.ndarray) -> InnerPairs:
+    """The pairs inside molecules, from the kinds (s_k,) and the positions (s_k, 3) of the sites of each species k, and
+    the number of its molecules."""
+    rows, count = [np.zeros((0, 3))], [np.zeros(0)]
+    for of_sites, position, molecules in zip(kinds, positions, counts, strict=True):
+        distance = np.linalg.norm(position[:, None] - position, axis=2).round(FINE)
+        one, other = np.broadcast_arrays(of_sites[:, None], of_sites)
+        of_species = np.stack([one, other, distance], axis=-1).reshape(-1, 3)
+        of_species, repeats = np.unique(of_species, axis=0, return_counts=True)
+        rows.append(of_species)
+        count.append(float(molecules) * repeats)
+    one, other, distance = np.concatenate(rows).T
+    return InnerPairs(one.astype(int), other.astype(int), distance, np.concatenate(count))
+
+
+class Tail(NamedTuple):
+    """Tail correction: the energy and pressure that truncation takes away, at any volume."""
+
+    energy_volume: float  # the part of the energy that is inverse to the volume, times the volume, u Å⁵/ps²
     pressure_square: float  # pressure times the volume squared, u Å⁵/ps²
+    constant: float = 0.0  # the part of the energy that does not depend on the volume, u Å²/ps²
 
     def energy(self, volume: float) -> float:
         """u Å²/ps²"""
-        return self.energy_volume / volume
+        return self.energy_volume / volume + self.constant
 
     def pressure(self, volume: float) -> float:
         """u/(Å ps²)"""
@@ -111,6 +146,11 @@ class Composition(NamedTuple):
     @property
     def charges(self) -> Charges:
         return charges_in(self.species, self.counts)
+
+    @property
+    def filled(self) -> float:
+        """See `errors.filled_fraction`."""
+        return filled_fraction(self.species, self.counts, self.space, self.position)
 
 
 class Settings(NamedTuple):

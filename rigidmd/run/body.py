@@ -239,6 +239,12 @@ class BodyRun(RunPart):
     def prepare(self) -> None:
         system, run, compiled = self.system, self.scene.run, self.system.engine()
         compiled.advance(compiled.begin(system.state, system.method), system.method, run.timestep_s, 0)
+        if run.has_scheme and (names := system.velocity_dependent_functions()):
+            self.simulation.note(
+                f"{' and '.join(names)}: depends on velocities, so that {run.integrator} is of order 1. For "
+                "friction and resistance use [friction] and [fluid], which keep order 2; otherwise integrator = "
+                "'dop853'"
+            )
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
         if not self.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
             return

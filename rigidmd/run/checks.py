@@ -161,7 +161,9 @@ def check_sample(system: System, limits: Watch, since: Sample, now: Sample) -> F
     drift = now.drift - (since.drift if since.stage == now.stage else 0.0)
     if np.isnan(drift):  # another engine, which does not count the heat of its thermostat
         return None
-    scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * abs(now.potential)
+    # constants of sums over images may cancel the rest of the potential, but not its rounding
+    rounded = abs(now.potential) + sum(map(abs, system.constants.values())) / KJ_PER_MOL
+    scale = kinetic + max(0.0, since.potential - now.potential) + ROUNDING * rounded
     if abs(drift) * fraction <= limits.energy * scale:
         return None
     n = len(system.model.species)

@@ -22,6 +22,7 @@ from rigidmd.forces.ewald.errors import (
 from rigidmd.forces.ewald.smooth import InverseR, Smooth
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.sites import compute_site_positions
+from rigidmd.forces.neighbors.space import fractions, space_of
 from rigidmd.forces.potentials.screened_coulomb import ScreenedCoulomb
 from rigidmd.mechanics.rotation import from_vector
 from rigidmd.scene.validation import not_none
@@ -72,7 +73,8 @@ def estimated_error(system: System, cell: np.ndarray) -> float:
     else:
         term = cast("Pme", term)
         reciprocal = pme_error(charges, term.smooth.alpha, cell, term.grid, term.order)
-    filled = filled_fraction(system.species, counts, volume)
+    position = fractions(system.space, system.state.position) @ cell
+    filled = filled_fraction(system.species, counts, space_of(cell), position)
     real = real_error(charges, term.smooth.alpha, cutoff, volume)
     return float(np.hypot(real, reciprocal)) / np.sqrt(filled) * COULOMB
 
@@ -138,6 +140,32 @@ def check_forces(system: System, state: State) -> None:
     SceneError with the numbers where they differ."""
     if errors := [error for name in system.user_terms if (error := _error_of_force(system, state, name))]:
         raise SceneError(system.scene.source, errors)
+
+
+def velocity_notes(system: System, state: State) -> list[str]:
+    """A note on each user-defined force that depends on the velocities: with other ones at the same positions it
+    differs, by more than where nothing changes."""
+    rng, other = np.random.default_rng(0), state.copy()
+    speed = np.abs(state.velocity).max(initial=0.0) or 1.0
+    spin = np.abs(state.angular_momentum_body).max(initial=0.0) or 1.0
+    other.velocity[:] += speed * rng.standard_normal(other.velocity.shape)
+    other.angular_momentum_body[:] += spin * rng.standard_normal(other.angular_momentum_body.shape)
+    found = []
+    for name in system.user_terms:
+        if isinstance(system.terms[name], PairForces):
+            continue
+        engine = system.engine_of({name: system.terms[name]}, "double")
+        (load, _), (again, _), (moved, _) = (engine.evaluate(at) for at in (state, state, other))
+        noise = [np.abs(a - b).max(initial=0.0) for a, b in zip(again, load, strict=True)]
+        change = [np.abs(a - b).max(initial=0.0) for a, b in zip(moved, load, strict=True)]
+        size = [np.abs(a).max(initial=0.0) + np.abs(b).max(initial=0.0) for a, b in zip(moved, load, strict=True)]
+        if any(c > NOISY * n + ROUNDING * s for c, n, s in zip(change, noise, size, strict=True)):
+            found.append(
+                f"{name}: its forces depend on velocities. Integrators take them as forces of positions, with an error "
+                "of order 1 in the step, and such forces have no energy that is conserved. For friction use thermostat "
+                "= 'langevin'; otherwise test with shorter steps"
+            )
+    return found
 
 
 def _error_of_force(system: System, state: State, name: str) -> str:

@@ -58,8 +58,9 @@ def remove_overlaps(
         if stop():
             break
         # Each molecule moves along its own force by at most `length`, so overlaps do not slow down the others.
-        shift = load.force * free[:, None] / np.abs(load.force[free]).max()
-        rotation = load.torque_body * rotates / arm / np.abs(load.force[free]).max()
+        shift, rotation = load.force * free[:, None], load.torque_body * rotates / arm
+        largest = np.abs(shift).max() or np.abs(rotation).max()  # in a uniform field there are torques alone
+        shift, rotation = shift / largest, rotation / largest
         reach = np.linalg.norm(shift, axis=1)
         reach[: len(rotation)] = np.maximum(reach[: len(rotation)], np.linalg.norm(rotation, axis=1))
         scaling = length / np.sqrt(reach.max() * np.maximum(reach, 1e-3 * reach.max()))

@@ -29,8 +29,8 @@ from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
-from rigidmd.run.force_errors import check_forces, coulomb_errors
-from rigidmd.run.minimise import OverlapRemoval, minimise, remove_overlaps
+from rigidmd.run.force_errors import check_forces, coulomb_errors, velocity_notes
+from rigidmd.run.minimise import Enthalpy, OverlapRemoval, minimise, remove_overlaps
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
@@ -170,10 +170,14 @@ class MolecularRun(RunPart):
             self._remove_overlaps()
             with user_errors_explained(self.system):
                 for k, stage in enumerate(self.scene.stages):
-                    if not (stage.is_auto or stage.is_minimisation):
+                    if stage.is_minimisation:
+                        self._compile_stage(k)
+                    elif not stage.is_auto:
                         method = self._integrator(k)
                         self.engine.advance(self._state_for(method), method, 0.0, 0)
         self.engine.forget()
+        for sentence in velocity_notes(self.system, self.state):
+            self.simulation.note(sentence)
 
     def _remove_overlaps(self) -> None:
         """Compile the forces, and remove overlaps of a lattice."""
@@ -191,15 +195,38 @@ class MolecularRun(RunPart):
             dt = first.timestep_fs * FEMTOSECOND
             removal = self.record.removal = remove_overlaps(system, self.engine, self.state, thermal, dt)
             if removal.excess > 1:
-                problem = (
-                    f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after "
-                    f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
-                    f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or "
-                    "shorten timestep_fs of the first stage"
-                )
-                raise SceneError(scene.source, [problem])
+                raise SceneError(scene.source, [self._why_too_strong(removal, thermal, dt)])
         check_forces(system, self.state)
         self.engine.forget()
+
+    def _why_too_strong(self, removal: OverlapRemoval, thermal: float, dt: float) -> str:
+        """Why forces are too strong for the first step after a removal of overlaps, with advice."""
+        system = self.system
+        fields = {name: system.terms[name] for name in system.external}
+        if fields:
+            load, _ = system.engine_of(fields, "double").evaluate(self.state)
+            if (excess := float(checks.kicks(system.model, load, thermal, dt).max())) > 1:
+                return (
+                    f"timestep_fs of the first stage is too long for {' and '.join(fields)}: the first time step would "
+                    f"change a momentum by {excess:.2g} times its thermal size. Shorten it, or weaken the field"
+                )
+        return (
+            f"the molecules cannot be packed at {system.density:.3g} g/cm³ without overlap: after "
+            f"{removal.steps} steps of overlap removal the first time step would change a momentum by "
+            f"{removal.excess:.2g} times its thermal size. Lower the density, enlarge the box or shorten "
+            "timestep_fs of the first stage"
+        )
+
+    def _compile_stage(self, k: int) -> None:
+        """Compile what stage k runs, so that its computing time does not contain it."""
+        stage, state = self.scene.stages[k], self.state
+        if stage.is_minimisation:
+            enthalpy = Enthalpy(self.system, stage, state)
+            point = enthalpy.at(state.copy())
+            enthalpy.moved(point.state, np.zeros(len(point.gradient)))
+        elif not self.scene.engine.is_external:
+            method = self._integrator(k)
+            self.system.engine().advance(self._state_for(method).copy(), method, 0.0, 0)
 
     def _state_for(self, method: Scheme | Solver) -> State:
         """The present state, without copies, with the additional variables of an integrator."""
@@ -241,6 +268,7 @@ class MolecularRun(RunPart):
         if not moves and not np.array_equal(self.state.cell, start.cell):
             raise ValueError("its box differs from the box of the scene")
         self.engine.recall(self.state, kept.of("engine").arrays)
+        self._compile_stage(k)
 
     def reenter_segment(self, k: int) -> Segment:
         stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
@@ -260,6 +288,7 @@ class MolecularRun(RunPart):
             scale_to_mean_box(self.system, self.state, self.samples(), k)
         if was_auto:
             self._choose(k)
+            self._compile_stage(k)
         if moves:
             self._estimate(k)
         # Pilot runs change the neighbour lists. With new lists at every stage the resolved scene repeats the run to the

@@ -156,20 +156,13 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
     others, and by the temperatures at the steps, which are not the temperatures of the ensemble.
     """
     of_stage = samples.of_stage(k)
+    if system.scene.stages[k].is_hybrid:  # its averages have no error of the step
+        return _notes_on_trajectories(system.scene.stages[k], k, of_stage["acceptance"])
     half = len(of_stage) // 2
     if len(of_stage) - half < MIN_SAMPLES:
         return []
     time, drift, whole = (of_stage[name][half:] for name in ("time", "drift", "temperature"))
     found, stage, freedom, level = [], system.scene.stages[k], system.freedom_in(k), float(whole.mean())
-    if stage.is_hybrid:  # its averages have no error of the step
-        accepted = float(of_stage["acceptance"][half:].mean())
-        if accepted > LEAST_ACCEPTANCE:
-            return []
-        return [
-            f"stages.{k}: in its second half {accepted:.1%} of the trajectories were accepted: positions hardly "
-            f"change and the errors of the means are too small. Try a shorter timestep_fs than {stage.timestep_fs:g}, "
-            "an integrator of higher order such as 'srkn_4', or integrator = 'auto'"
-        ]
     line, thermal = slope(time, drift), BOLTZMANN / KJ_PER_MOL * level * freedom.total
     if thermal > 0 and abs(line.value) > _drift_limit(time[-1] - time[0]) * thermal + STANDARD_ERRORS * line.error:
         rate, error = (value * 1000 / thermal for value in (line.value, line.error))
@@ -208,6 +201,22 @@ def _notes_on_averages(system: System, samples: Samples, k: int) -> list[str]:
             "run longer before means are taken"
         )
     return found
+
+
+def _notes_on_trajectories(stage: Stage, k: int, acceptance: np.ndarray) -> list[str]:
+    """A note if few trajectories of hybrid Monte Carlo were accepted, in the second half of enough samples, or if none
+    was. acceptance (t,) : between samples, NaN where no trajectory ended"""
+    known = acceptance[np.isfinite(acceptance)]
+    enough = len(acceptance) - len(acceptance) // 2 >= MIN_SAMPLES
+    judged, where = (known[len(known) // 2 :], "in its second half ") if enough else (known, "")
+    accepted = float(judged.mean()) if len(judged) else 1.0
+    if accepted > (LEAST_ACCEPTANCE if enough else 0.0):
+        return []
+    return [
+        f"stages.{k}: {where}{accepted:.1%} of the trajectories were accepted: positions hardly change and "
+        f"the errors of the means are too small. Try a shorter timestep_fs than {stage.timestep_fs:g}, an "
+        "integrator of higher order such as 'srkn_4', or integrator = 'auto'"
+    ]
 
 
 def _drift_limit(time: float) -> float:

@@ -316,13 +316,14 @@ class MolecularScene(Scene):
             ("output.log_interval_ps", output.log_interval_ps),
             ("output.trajectory_interval_ps", output.trajectory and output.trajectory_interval_ps),
             ("output.pressure_tensor_interval_ps", output.pressure_tensor_interval_ps),
-            ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps),
         ]
         for k in range(len(self.stages)) if stages is None else stages:
             stage = self.stages[k]
             if stage.is_minimisation or stage.is_auto:
                 continue
             of_stage = [(f"stages.{k}.{key}", getattr(stage, key)) for key in ("duration_ps", "barostat_interval_ps")]
+            if stage.keeps_momentum:  # elsewhere nothing is removed
+                of_stage.insert(0, ("run.remove_momentum_interval_ps", self.run.remove_momentum_interval_ps))
             for key, wanted in [*of_run, *of_stage]:
                 taken = wanted and stage.steps_of(wanted) * stage.timestep_fs / 1000
                 if wanted and taken < MOST_STEPS * stage.timestep_fs / 1000 and abs(taken - wanted) > 1e-9 * wanted:

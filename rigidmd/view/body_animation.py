@@ -32,6 +32,8 @@ ARROW = {"arrowstyle": "-|>,head_width=0.25,head_length=0.5", "lw": 2, "shrinkA"
 MAX_ROTATION = 0.5
 #: Differences of Q (rad), and of velocities and position, in their largest values, at which a motion has returned.
 RETURN_ANGLE, RETURN_FRACTION = 0.03, 0.02
+#: As a fraction of these: a motion that returns to what a picture can show. Others nearly return.
+EXACT_RETURN = 0.02
 
 
 class BodyAnimation:
@@ -193,7 +195,8 @@ class BodyAnimation:
             return float(self.time[-1]), []
         near = back[np.searchsorted(back, back[-1] - 0.1 * len(off)) :]  # the best of the last returns
         end = float(self.time[near[off[near].argmin()]])
-        return end, [f"The motion returns to its start at {end:.6g} s, where the animation ends."]
+        how = "returns to its start" if off[near].min() < EXACT_RETURN else "nearly returns to its start"
+        return end, [f"The motion {how} at {end:.6g} s, where the animation ends."]
 
     def film_notes(self, interval: float, seconds: float) -> list[str]:
         """A sentence if the body rotates too far between frames for its rotation to be seen."""

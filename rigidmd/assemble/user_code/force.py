@@ -100,7 +100,8 @@ class BoundForce:
         else:
             energy, force, torque, virial = self._parts(self._called("on_molecules", state), 4)
         self._fill(workspace.force, force, "forces")
-        self._fill(workspace.torque_body, torque, "torques")
+        # points, which have no torques, may get those of molecules
+        self._fill(workspace.torque_body, torque if len(state.rotation) else None, "torques")
         if not np.isfinite(energy):
             raise self._error(f"the energy {energy}")
         numbers = np.zeros((3, 3)) if virial is None else _numbers(virial)

@@ -14,7 +14,7 @@ from rigidmd.core.files import unreadable_reason
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
 from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
-from rigidmd.forces.parts import Tail, gather_per_molecule, sites_named
+from rigidmd.forces.parts import Tail, gather_per_molecule, inner_pairs, sites_named, sum_of_tails
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
     DISTANCE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table,
@@ -111,7 +111,8 @@ class PairLaw:
         count = len(types.all)
         numbers = np.zeros((len(formula.kind._fields), count, count))  # type: ignore[attr-defined]  # a NamedTuple
         ends, acts = np.zeros((4, count, count)), np.zeros((count, count))
-        members, beyond = np.bincount(kind, minlength=count), Tail(0.0, 0.0)
+        members, tails = np.bincount(kind, minlength=count), []
+        inner = inner_pairs(kinds, offsets, np.bincount(index, minlength=len(system.species)))
         faults: list[str] = []
         short: list[tuple[float, str]] = []
         for i, j, of_pair in types.pairs(faults):
@@ -122,9 +123,9 @@ class PairLaw:
                 if forces.tail_correction and formula.shared:
                     raise FormulaError("a table is finite, and forces.tail_correction needs its energy beyond")
                 if forces.tail_correction:
-                    part, pairs = tail_of_pair(radial, ends[:, i, j], shape), float(members[i] * members[j])
-                    pairs *= 1.0 if i == j else 2.0
-                    beyond = Tail(beyond[0] + pairs * part[0], beyond[1] + pairs * part[1])
+                    part = tail_of_pair(radial, tuple(ends[:, i, j].tolist()), shape, inner.between(i, j))
+                    pairs = float(members[i] * members[j]) * (1.0 if i == j else 2.0)
+                    tails.append(Tail(pairs * part.energy_volume, pairs * part.pressure_square, part.constant))
                 if not np.isfinite([*values, *numbers[:, i, j], *ends[:, i, j]]).all():
                     raise FormulaError("it has no finite value at the cutoff")
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
@@ -146,7 +147,7 @@ class PairLaw:
         )  # fmt: skip
         term = pair_forces(potential, sites, exclusion_groups(sites, (system.model.inverse_mass == 0)[index]))
         notes = [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else []
-        return term, formula, beyond if forces.tail_correction else None, notes
+        return term, formula, sum_of_tails(tails), notes
 
 
 def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:

@@ -282,7 +282,7 @@ def input_script(view: ForceFieldView) -> str:
         lines, added = [*lines, f"# pe includes {what}"], [f"({_num(constant / KCAL)})"]
     if system.tail is not None:
         lines += ["# potential includes Lennard-Jones beyond the cutoff, pe and press do not"]
-        added += [f"({_num(system.tail.energy_volume / KCAL)})/vol"]
+        added += [f"({_num(system.tail.energy_volume / KCAL)})/vol", f"({_num(system.tail.constant / KCAL)})"]
     if added:
         lines += [f"variable potential equal {'+'.join(['pe', *added])}"]
         columns += " v_potential"

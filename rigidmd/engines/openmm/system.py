@@ -248,8 +248,8 @@ def _forces(particles: Layout, separate: bool) -> list[tuple[Any, int]]:
             height = f"{-(1 / coulomb.cutoff + coulomb.field * coulomb.cutoff**2)!r}"
             found.append((_custom_coulomb(particles, height), Group.STEP_COULOMB))
     if (tail := view.system.tail) is not None:
-        energy = float(tail.energy_volume) / KJ_PER_MOL * NM**3
-        found.append((library().CustomVolumeForce(f"{energy!r}/v"), Group.TAIL))
+        energy, constant = float(tail.energy_volume) / KJ_PER_MOL * NM**3, float(tail.constant) / KJ_PER_MOL
+        found.append((library().CustomVolumeForce(f"{energy!r}/v+({constant!r})"), Group.TAIL))
     return found
 
 

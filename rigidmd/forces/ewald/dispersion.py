@@ -11,8 +11,7 @@ import numpy as np
 
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    MAX_ALPHA_CUTOFF, Dispersing, alpha_for, charges_in, filled_fraction, k_cutoff_for, pme_error, pme_grid_for,
-    real_error,
+    MAX_ALPHA_CUTOFF, Dispersing, alpha_for, charges_in, k_cutoff_for, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors.space import cell_of
@@ -38,8 +37,9 @@ def settings(forces: Any, composition: Composition, cutoff: float | None) -> Set
     if sites.count == 0:
         return Settings({}, [f"{where}, and no site has Lennard-Jones parameters; use cutoff"])
     accuracy = forces.dispersion_accuracy or ACCURACY
-    cell, filled = cell_of(space), filled_fraction(species, counts, space.volume)
-    part = _error(accuracy, species, counts) * sqrt(filled / 2)  # of the real-space and of the reciprocal error
+    cell = cell_of(space)
+    # of the real-space and of the reciprocal error
+    part = _error(accuracy, species, counts) * sqrt(composition.filled / 2)
     beta = float(forces.dispersion_beta_per_A or alpha_for(sites, cutoff, space.volume, part))
     numbers = {"dispersion_accuracy": accuracy, "dispersion_beta_per_A": beta}
     unreachable = f"forces.dispersion_accuracy = {accuracy:g} cannot be reached at beta = {beta:.3g} 1/Å"
@@ -78,8 +78,7 @@ def interactions(parts: SystemParts) -> Interactions:
     strength, sites = gather_per_molecule(strengths, parts.model.species), parts.sites(present)
     beta, cell, cutoff = forces.dispersion_beta_per_A, cell_of(parts.space), forces.cutoff_A
     smooth, dispersing = InverseR6(beta), dispersing_in(species, counts)
-    filled = filled_fraction(species, counts, volume)
-    k_space = _error(forces.dispersion_accuracy, species, counts) * sqrt(filled / 2)
+    k_space = _error(forces.dispersion_accuracy, species, counts) * sqrt(parts.filled / 2)
     if forces.dispersion == "ewald":
         reciprocal = 2 * pi * np.linalg.inv(cell).T
         vectors = direct_sum.k_vectors_within(reciprocal, k_cutoff_for(dispersing, beta, reciprocal, k_space))
@@ -101,7 +100,7 @@ def interactions(parts: SystemParts) -> Interactions:
         "dispersion_mean": corrections.MeanDispersion(-(pi**1.5) * beta**3 / 6 * float(strength.sum()) ** 2),
     }
     constants = {"dispersion_self": beta**6 / 12 * float(strength @ strength), "dispersion_intramolecular": inside}
-    error = np.hypot(k_space, real_error(dispersing, beta, cutoff, volume)) / sqrt(filled) / KJ_PER_MOL
+    error = np.hypot(k_space, real_error(dispersing, beta, cutoff, volume)) / sqrt(parts.filled) / KJ_PER_MOL
     note = (
         f"dispersion by {forces.dispersion}: beta {beta:.6g} 1/Å, {how}; "
         f"estimated rms error of its force on a site: {error:.2g} kJ/(mol Å)"

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import erfcx, gammaincc
 
+from rigidmd.forces.neighbors.space import Space, longest_gaps
+
 MAX_ALPHA_CUTOFF = 8.0  # of alpha times the cutoff: erfc is 1e-29 there
 #: Along an edge in estimates: errors depend on the spacing, not on the number of points. With 16 they are good to 5 %.
 MAX_PROXY_POINTS, SEARCH_PROXY_POINTS = 32, 16
@@ -118,13 +120,17 @@ def alpha_for(charges: Charges, cutoff: float, volume: float, error: float) -> f
     return max(0.5, sqrt(max(0.0, np.log(most / error)))) / cutoff
 
 
-def filled_fraction(species: list[Any], counts: np.ndarray, volume: float) -> float:
-    """The part of a volume (Å³) that molecules fill where they touch each other, at most 1; 1 for charges without size.
-    A dilute box may contain such a cluster, so its errors are those of this density."""
-    filled = 0.0
-    for m, n in zip(species, map(int, counts), strict=True):
-        filled += n * (2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma)) ** 3
-    return min(1.0, filled / volume) or 1.0
+def filled_fraction(species: list[Any], counts: np.ndarray, space: Space, position: np.ndarray) -> float:
+    """The part of a periodic box that contains the molecules, at most 1; 1 for charges without size. The density of
+    this part decides on the errors.
+
+    It is not larger than the molecules are where they touch each other: a dilute box may contain such a cluster. Nor
+    than the part of each edge with molecules at the start, from their centres of mass `position` (n, 3): a slab.
+    """
+    diameters = np.array([2 * np.linalg.norm(m.positions_body, axis=1).max() + max(m.sigma) for m in species])
+    touching = float(counts @ diameters**3) / space.volume
+    empty = np.maximum(longest_gaps(space, position) - diameters[counts > 0].max(), 0.0) / space.edges
+    return min(1.0, touching, float(np.prod(1 - empty))) or 1.0
 
 
 def k_space_error(charges: Charges, alpha: float, radius: float, volume: float) -> float:

@@ -10,8 +10,8 @@ from rigidmd.core.state import State
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald import corrections, direct_sum
 from rigidmd.forces.ewald.errors import (
-    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, filled_fraction,
-    k_cutoff_for, k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
+    COARSE_SPACING, MAX_ALPHA_CUTOFF, MAX_GRID_POINTS, alpha_for, charges_in, fastest_cutoff, k_cutoff_for,
+    k_cutoff_of_count, k_space_error, pme_error, pme_grid_for, real_error,
 )  # fmt: skip
 from rigidmd.forces.ewald.smooth import InverseR
 from rigidmd.forces.neighbors.sites import BodySites, CentralSites
@@ -56,7 +56,7 @@ def settings(forces: Any, composition: Composition, cutoff: float, is_external: 
     if charges.count == 0:
         return Settings(numbers, [])
     accuracy = forces.ewald_accuracy or ACCURACY
-    filled = filled_fraction(composition.species, composition.counts, composition.space.volume)
+    filled = composition.filled
     part = accuracy * sqrt(filled / 2)  # of the real-space and of the reciprocal error, at the mean density
     free = (forces.ewald_cutoff_A, forces.ewald_alpha_per_A, forces.pme_order, forces.pme_grid) == (None,) * 4
     if forces.electrostatics == "pme" and free and not is_external:
@@ -145,8 +145,7 @@ def _errors(parts: SystemParts) -> tuple[float, float, direct_sum.KVectors | Non
 def interactions(parts: SystemParts) -> Interactions:
     """The charges of a scene with an Ewald sum. Raises SceneError."""
     forces, (sites, charge_e), (real, k_space, vectors) = parts.scene.forces, parts.charged(), _errors(parts)
-    filled = filled_fraction(parts.species, parts.counts, parts.space.volume)
-    real, k_space = real / sqrt(filled), k_space / sqrt(filled)
+    real, k_space = real / sqrt(parts.filled), k_space / sqrt(parts.filled)
     alpha, cutoff, charge = forces.ewald_alpha_per_A, forces.ewald_cutoff_A, charge_e * COULOMB_CHARGE
     shifted = forces.ewald_truncation == "shift"
     potential = screened_coulomb(charge_e, cutoff, alpha, shifted, FIT_ERROR_FRACTION * real)

@@ -89,6 +89,12 @@ def fractions(space: Space, position: np.ndarray) -> np.ndarray:
     return np.stack([a, b, c], axis=1)
 
 
+def longest_gaps(space: Space, position: np.ndarray) -> np.ndarray:
+    """The longest part (3,) of each edge of a periodic box without any of the positions (n, 3), Å."""
+    fraction = np.sort(fractions(space, position) % 1.0, axis=0)
+    return np.diff(fraction, axis=0, append=fraction[:1] + 1.0).max(axis=0) * space.edges
+
+
 @kernel(inline=True)
 def volume_of(cell):
     """Volume of a cell (3, 3) in standard orientation, Å³."""

@@ -16,8 +16,9 @@ from scipy.integrate import quad
 from rigidmd.compile import chosen_by_type, implements, is_a
 from rigidmd.compile.simd import evaluate_cubic, inverse, inverse_square_root, load, select, zeros
 from rigidmd.forces.neighbors import pair_loop as pairs
+from rigidmd.forces.parts import InnerPairs, Tail
 from rigidmd.forces.potentials.truncation import (
-    SWITCH_FUNCTIONS, ForceShifted, Truncation, TruncationTerms, Unmodified, truncated, truncation_polynomial,
+    ForceShifted, Truncation, TruncationTerms, Unmodified, integral_of_removed_energy, removed_energy, truncated,
 )  # fmt: skip
 
 
@@ -133,24 +134,26 @@ def _arrange(slot_potential, potential, order):
                 table[at + (5 + p) * stride] = potential.parameters[p, k, kind]
 
 
-def tail_of_pair(radial: Callable[[float], tuple], terms: np.ndarray, truncation: Truncation) -> tuple[float, float]:
-    """The tail correction of one pair: of the energy, times the volume, and of the pressure, times its square. See
-    `lennard_jones.tail`. Raises ArithmeticError if the energy falls too slowly."""
+def tail_of_pair(
+    radial: Callable[[float], tuple], terms: TruncationTerms, truncation: Truncation, inner: InnerPairs | None = None
+) -> Tail:
+    """The tail correction of one pair of sites, with the constant of the `inner` pairs, which are all of these kinds.
+    See `lennard_jones.tail`. Raises ArithmeticError if the energy falls too slowly."""
     cutoff = truncation.cutoff
     far = [abs(radial(factor * cutoff)[0]) * factor**3 for factor in (1.0, 1e3)]
     if far[1] > 0.1 * far[0]:
         raise ArithmeticError("its energy falls too slowly with the distance for tail_correction")
-    start = getattr(truncation, "start", cutoff)
 
-    def lost(r: float) -> float:
-        if isinstance(truncation, Unmodified | ForceShifted):
-            return -(r**2) * (terms[0] + (truncation_polynomial(tuple(terms), r - start)[0] if r > start else 0.0))
-        return r**2 * radial(r)[0] * (1 - SWITCH_FUNCTIONS[type(truncation)](truncation, r)[0])
+    def energy(r: np.ndarray) -> np.ndarray:
+        return np.array([radial(x)[0] for x in r.tolist()])
 
-    inside = -terms[0] * start**3 / 3 + (quad(lost, start, cutoff)[0] if start < cutoff else 0.0)
     beyond = quad(lambda r: r**2 * radial(r)[0], cutoff, inf, limit=200)[0]
+    removed = beyond + integral_of_removed_energy(energy, truncation, terms)
     jump = (radial(cutoff)[0] + terms[0]) * cutoff**3 / 3 if isinstance(truncation, Unmodified) else 0.0
-    return 2 * pi * (inside + beyond), 2 * pi * (inside + beyond + jump)
+    constant = 0.0
+    if inner is not None:
+        constant = -float(inner.count @ removed_energy(energy, truncation, terms, inner.distance)) / 2
+    return Tail(2 * pi * removed, 2 * pi * (removed + jump), constant)
 
 
 class Table(NamedTuple):

@@ -1,24 +1,26 @@
 """Lennard-Jones: 4 epsilon ((sigma/r)¹² - (sigma/r)⁶), with truncation, mixing rules and tail correction."""
 
 # isort: skip_file
+from collections.abc import Callable
 from math import inf, pi
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import types
-from scipy.integrate import quad
 
 from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.simd import inverse, inverse_square_root, load, polynomial, zeros
 from rigidmd.errors import SceneError
 from rigidmd.forces.ewald.smooth import InverseR6
 from rigidmd.forces.neighbors import pair_loop as pairs
-from rigidmd.forces.parts import Interactions, SystemParts, Tail, gather_per_molecule, sites_named
+from rigidmd.forces.parts import (
+    InnerPairs, Interactions, SystemParts, Tail, gather_per_molecule, inner_pairs, sites_named,
+)  # fmt: skip
 from rigidmd.forces.potentials.screened_coulomb import Screening, dispersion_screening
 from rigidmd.forces.potentials.truncation import (
-    MINIMUM_TOLERANCE, NO_SWITCH, SWITCH_FUNCTIONS, ForceShifted, SwitchCorrection, SwitchTerm, Truncation,
-    TruncationName, TruncationTerms, Unmodified, correction, needs_root, short_cutoff_note, switch_correction_of,
-    switch_term, switch_term_of, truncated, truncation_of, truncation_polynomial, truncation_terms,
+    MINIMUM_TOLERANCE, NO_SWITCH, SwitchCorrection, SwitchTerm, Truncation, TruncationName, TruncationTerms,
+    Unmodified, correction, integral_of_removed_energy, needs_root, removed_energy, short_cutoff_note,
+    switch_correction_of, switch_term, switch_term_of, truncated, truncation_of, truncation_terms,
 )  # fmt: skip
 from rigidmd.units import KJ_PER_MOL
 
@@ -149,9 +151,11 @@ def interactions(parts: SystemParts) -> Interactions:
     names = [
         np.array([f"{m.name}.{m.site_names[i]}" for i in c], object) for m, c in zip(species, indices, strict=True)
     ]
+    positions = [m.positions_body[i] for m, i in zip(species, indices, strict=True)]
+    inner = inner_pairs(of_species, positions, parts.counts)
     return Interactions(
         {"lennard_jones": parts.pair_forces(potential, parts.sites(indices))}, {},
-        tail=tail(potential) if forces.tail_correction else None,
+        tail=tail(potential, inner) if forces.tail_correction else None,
         notes=_short_cutoff_notes(potential, gather_per_molecule(names, index)),
     )  # fmt: skip
 
@@ -312,33 +316,26 @@ def _arrange_strengths(in_slots, dispersion, order):
     return arrange
 
 
-def tail(potential: LennardJones) -> Tail:
+def tail(potential: LennardJones, inner: InnerPairs | None = None) -> Tail:
     """The tail correction, for g(r) = 1 where the truncation changes the potential, see the theory chapter
-    `interactions` (Allen & Tildesley 2017, 2.8)."""
+    `interactions` (Allen & Tildesley 2017, 2.8). inner : the pairs that are not interactions; None of points without"""
     count = np.bincount(potential.kind, minlength=len(potential.c6))
-    energy = pressure = 0.0
+    energy = pressure = constant = 0.0
     for sign, c, p, terms in ((1, potential.c12, 12, potential.terms12), (-1, potential.c6, 6, potential.terms6)):
-        lost = _lost(potential, terms, p)
+        power = _power(p)
+        beyond = potential.cutoff ** (3 - p) / (p - 3)
+        removed = beyond + integral_of_removed_energy(power, potential.truncation, terms)
         # The pressure follows from the force alone: a jump of the energy at the cutoff (plain) does not contribute.
         jumps = terms[0] == 0 and isinstance(potential.truncation, Unmodified)
         jump = potential.cutoff ** (3 - p) / 3 if jumps else 0.0
         strength = sign * count @ c @ count
-        energy += 2 * pi * strength * lost
-        pressure += 2 * pi * strength * (lost + jump)
-    return Tail(energy, pressure)
+        energy += 2 * pi * strength * removed
+        pressure += 2 * pi * strength * (removed + jump)
+        if inner is not None:  # the molecule itself is part of the uniform liquid, but not among its own neighbours
+            of_pairs = removed_energy(power, potential.truncation, terms, inner.distance)
+            constant -= sign * float(inner.count * c[inner.one, inner.other] @ of_pairs) / 2
+    return Tail(energy, pressure, constant)
 
 
-def _lost(potential: LennardJones, terms: np.ndarray, p: int) -> float:
-    """Integral of r² (r⁻ᵖ - truncated r⁻ᵖ) over all r."""
-    beyond = potential.cutoff ** (3 - p) / (p - 3)
-    inside = -terms[0] * potential.cutoff**3 / 3
-    if isinstance(potential.truncation, Unmodified):
-        return beyond + inside
-    start = potential.truncation.start
-
-    def lost(r: float) -> float:
-        if isinstance(potential.truncation, ForceShifted):
-            return -(r**2) * truncation_polynomial(terms, r - start)[0]
-        return (1 - SWITCH_FUNCTIONS[type(potential.truncation)](potential.truncation, r)[0]) * r ** (2 - p)
-
-    return beyond + inside + quad(lost, start, potential.cutoff)[0]
+def _power(p: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda r: r ** -float(p)

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
+from scipy.integrate import quad
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_square_root, polynomial
@@ -248,6 +249,38 @@ def nonic(truncation, r):
 
 
 SWITCH_FUNCTIONS = {Switched: quintic, SmoothlySwitched: nonic}
+
+
+def removed_energy(
+    energy: Callable[[np.ndarray], np.ndarray], truncation: Truncation, terms: TruncationTerms, r: np.ndarray
+) -> np.ndarray:
+    """The energy v(r) of a radial part less its truncated energy, at distances r (p,) in Å, 0 included.
+
+    energy : v, only called where it is needed, and not at 0 unless the truncation starts there
+    """
+    found = np.full(r.shape, -terms[0])
+    if isinstance(truncation, ForceShifted):
+        polynomial_terms = tuple(float(x) for x in terms)
+        found -= [truncation_polynomial(polynomial_terms, max(x - truncation.start, 0.0))[0] for x in r.tolist()]
+    elif not isinstance(truncation, Unmodified):
+        switched, switch = r > truncation.start, SWITCH_FUNCTIONS[type(truncation)]
+        found[switched] = energy(r[switched]) * [1 - switch(truncation, x)[0] for x in r[switched].tolist()]
+    found[r > truncation.cutoff] = energy(r[r > truncation.cutoff])
+    return found
+
+
+def integral_of_removed_energy(
+    energy: Callable[[np.ndarray], np.ndarray], truncation: Truncation, terms: TruncationTerms
+) -> float:
+    """Integral of r² (v(r) - truncated v(r)) from 0 to the cutoff."""
+    start = truncation.cutoff if isinstance(truncation, Unmodified) else truncation.start
+
+    def removed(r: float) -> float:
+        return r**2 * float(removed_energy(energy, truncation, terms, np.array([r]))[0])
+
+    inside = -terms[0] * start**3 / 3
+    return inside + (quad(removed, start, truncation.cutoff)[0] if start < truncation.cutoff else 0.0)
+
 
 #: A cutoff this close to the minimum of an energy, as a fraction, is the rounded minimum of a repulsive potential.
 MINIMUM_TOLERANCE = 0.01

@@ -124,6 +124,12 @@ class Trial:
         return (max(self.seconds) - min(self.seconds)) / self.time if len(self.seconds) > 1 else None
 
     @property
+    def conservation_error(self) -> float:
+        """The error of the energy, or a larger relative one of QᵀQ or of another conserved quantity."""
+        others = [self.orthogonality_error, *self.conserved_errors.values()]
+        return max(self.energy_rms, *(error for error in others if not np.isnan(error)), 0.0)
+
+    @property
     def trajectory_error(self) -> float:
         """The error of the rotation, or of the position if nothing rotates."""
         return self.position_error if np.isnan(self.rotation_error) else self.rotation_error

@@ -210,8 +210,10 @@ def cheapest(found: IntegratorAccuracy) -> list[tuple[str, str, str, str]]:
     that are as fast. Errors with the same answer are one row."""
     s, rows, unit = found.trial_system, [], found.trial_system.time_unit
     rotates = any(not np.isnan(t.rotation_error) for t in found.trials)
+    # A motion of a body with the right energy is not advised if QᵀQ or another invariant is worse.
+    energy = "energy_rms" if s.time_unit == "fs" else "conservation_error"
     kinds = {
-        "energy_rms": ("an energy error", s.energy_unit),
+        energy: ("an energy error", s.energy_unit),
         "trajectory_error": ("an error of Q", "") if rotates else ("an error of X", s.length_unit),
     }
     for error, (what, of) in kinds.items():
