@@ -33,7 +33,7 @@ from rigidmd.compile import (
     pack_arguments,
     task,
 )
-from rigidmd.compile.cache import CacheIndex, cache_folder
+from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
 from rigidmd.compile.code import array_struct
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 
@@ -527,6 +527,16 @@ def test_an_index_loses_nothing_that_is_stored_at_the_same_time(tmp_path):
         list(pool.map(lambda key: CacheIndex(str(tmp_path), "f", 0).save(key, f"code {key}"), keys))
     found = [CacheIndex(str(tmp_path), "f", 0).load(key) for key in keys]
     assert found == [f"code {key}" for key in keys]
+
+
+def test_compiling_is_announced_only_if_something_is_compiled(tmp_path):
+    said, key = [], ((types.UniTuple(types.float64, 3),), ())
+    for expected in (["compiling"], ["compiling"]):
+        with compiling_announced(lambda: said.append("compiling")):
+            if CacheIndex(str(tmp_path), "f", 0).load(key) is None:
+                CacheIndex(str(tmp_path), "f", 0).load(((types.none,), ()))
+                CacheIndex(str(tmp_path), "f", 0).save(key, "code")
+        assert said == expected
 
 
 # --- folders of others -----------------------------------------------------------------------------------------------
