@@ -284,6 +284,7 @@ HOMES = {
     "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS NOTEBOOKS find_example",
     "analysis.result": "Curve AnalysisResult Value converged_value",
+    "analysis.runs": "Runs",
     "analysis.rigid_frames": "without_rounding fit_frames frames_of_folder",
     "io.formats.bonds": "bonds connections",
     "dynamics.model": "Model draw_momenta mobile remove_momentum",
@@ -294,7 +295,6 @@ HOMES = {
     "analysis.files": "ANALYSIS analyse_folder read_results",
     "analysis.built_in.interfaces": "Slab fitted interfaces slab_of surface_tension",
     "analysis.built_in.transport": "MPA_S NM2_PER_S correlation diffusion msd squared_displacement viscosity",
-    "studies.sweep.replicas": "over_replicas",
     "analysis.built_in.structure": "density_profile hydrogen_bonds rdf structure_factor",
     "analysis.built_in.rotation": "PER_CM dielectric orientation spectrum total_dipole",
     "io.formats.atoms": "Frame element_of element_of_mass",
@@ -415,7 +415,7 @@ HOMES = {
         "CASES CRASH CaseResult Outcome REFUSED REPORTED RIGHT UNDETECTED failure longest_step"
     ),
     "studies.sweep.backends": "Cluster Pool",
-    "studies.sweep.table": "SweepRow summarise_run",
+    "studies.sweep.table": "SweepRow axis_label summarise_run",
     "studies.other_engines": "export verify",
 }
 

@@ -13,6 +13,7 @@ from support import (
     build,
     history,
     interfaces,
+    noise_with_memory,
     random_rotations,
     slab_of,
     small_scene,
@@ -237,6 +238,35 @@ def test_the_surface_tension_is_half_the_box_times_the_difference_of_pressures()
     assert found.value == pytest.approx(0.01 * 40.0 * 250.0, abs=4 * found.error)
     assert found.unit == "mN/m"
     assert pytest.approx(0.602214, rel=1e-5) == 100 * BAR  # 1 mN/m in u/ps²
+
+
+@pytest.mark.parametrize("seeds", [6, pytest.param(60, marks=pytest.mark.soak)])
+def test_densities_of_a_slab_that_change_slowly_have_honest_errors(seeds):
+    """The number of molecules in the vapour wanders with 20 frames of correlation, in 400 frames."""
+    system, _, cell, _ = synthetic(np.random.default_rng(0), 2)
+    found = {"liquid": [], "vapour": [], "thickness of the slab": []}
+    grid = np.linspace(0.0, 40.0, 2001)
+    tanh = 0.5 * (1 - np.tanh((grid - HALF) / WIDTH))
+    vapour, liquid = (np.cumsum(part) / part.sum() for part in (1 - tanh, tanh))
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        wander = noise_with_memory(rng, 400, (1,), 1.0, 20.0, 1.0)[:, 0]
+        fraction = np.clip(0.1 + 0.025 * wander, 0.0, 1.0)  # of the molecules
+        chosen = rng.random((400, 600))
+        is_vapour = rng.random((400, 600)) < fraction[:, None]
+        z = np.where(is_vapour, np.interp(chosen, vapour, grid), np.interp(chosen, liquid, grid))
+        positions = 20.0 * rng.random((400, 600, 3))
+        positions[..., 2] = z * rng.choice([-1, 1], (400, 600)) + 30.0
+        Q = np.broadcast_to(np.eye(3), (400, 600, 3, 3))
+        told = interfaces(history(system, np.arange(400.0), positions, cell, Q))
+        for name, values in found.items():
+            values.append(told.value(name)[2:4])
+    unit = 600 * system.species[0].mass / (2 * 400.0) / GRAM_PER_CM3
+    truth = {"vapour": 0.1 * unit / np.trapezoid(1 - tanh, grid)}
+    truth["liquid"] = 0.9 * unit / np.trapezoid(tanh, grid)
+    for name, value in truth.items():
+        pulls = [(mean - value) / error for mean, error in found[name]]
+        assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < (2.0 if seeds < 20 else 1.4), name
 
 
 def test_a_surface_tension_without_the_pressure_tensor_says_what_to_set():

@@ -149,7 +149,7 @@ def test_a_sweep_is_read(tmp_path):
     assert list(found.runs) == list(table.runs) == ["temperature_K=80", "temperature_K=90"]
     first, second = (rigidmd.read_run(path) for path in found.runs.values())
     assert first["temperature"][0] < second["temperature"][0]
-    with pytest.raises(TypeError, match=r"takes the results of one run, not <Table.*table\.runs"):
+    with pytest.raises(TypeError, match=r"takes the results of a run, or a list of them, not <Table.*table\.runs"):
         rigidmd.analysis.rdf(found)
     assert snapshot(folder) == before
 

@@ -17,24 +17,22 @@ import numpy as np
 import pytest
 from support import (
     ROOT,
-    AnalysisResult,
     Axis,
-    Curve,
     FolderLock,
     Pool,
     SweepRow,
-    Value,
     Waiting,
+    axis_label,
     code_kind,
     extrapolate,
     format_ranges,
     format_walltime,
     limits,
-    over_replicas,
     parse_axis,
     point_name,
     read_manifest,
     read_record,
+    registry,
     run_points,
     short_keys,
     summarise_run,
@@ -211,7 +209,7 @@ def test_a_sweep_is_a_folder_a_point_a_table_and_a_figure(finished):
         assert float(row["Temperature (K)"]) == pytest.approx(np.mean(found), rel=1e-8)
         error = abs(found[0] - found[1]) / 2  # standard deviation over the root of 2
         assert float(row["Temperature (K) error"]) == pytest.approx(error, rel=1e-6)
-        assert float(row["Box Volume (nm^3) error"]) == 0
+        assert "Box Volume (nm^3) error" not in row  # a constant has no error
     assert (finished / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -325,7 +323,7 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
 def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
     """By dt⁴ for srkn_4: 1, 16, 81 times the slope."""
     folder = tmp_path / "steps"
-    fixed = {"stages.0.duration_ps": 0.5, "output.log_interval_ps": 0.02, "stages.0.integrator": "srkn_4"}
+    fixed = {"stages.0.duration_ps": 2.0, "output.log_interval_ps": 0.02, "stages.0.integrator": "srkn_4"}
     with ExitStack() as stack:
         axes = sweeping.axes_of({STEP: [5, 10, 20]} | fixed)
         there = sweeping.open_sweep(stack, argon, axes, folder, step=STEP)
@@ -334,7 +332,7 @@ def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path
         found = limits.extrapolate_sweep(folder, there.manifest, STEP)
     assert "dt⁴ (srkn_4)" in found.title
     assert {limit.fit.order for limit in found.limits} == {4}
-    limit = next(limit for limit in found.limits if limit.quantity == "Temperature (K)")
+    limit = next(limit for limit in found.limits if len(limit.points) == 3)
     assert limit.fit == extrapolate(limit.points, order=4) != extrapolate(limit.points, order=2)
 
 
@@ -377,29 +375,93 @@ def test_what_cannot_be_extrapolated(argon, finished, tmp_path, capsys):
     assert "needs a sweep over a time step" in capsys.readouterr().err
 
 
-def test_replicas_of_unlike_axes_and_short_runs():
-    def found(x, value):
-        curve = Curve("msd", ("t", x), "MSD", {"MSD": 2 * x}, {"MSD": x})
-        return [AnalysisResult("msd", "about", [Value("D", "", value, 9.0)], [curve], ["note"])]
+def test_analyses_of_a_sweep_go_on_without_a_damaged_point(copied, capsys, monkeypatch):
+    """One point cannot be read, one analysis has an error of ours, one is not possible."""
+    (copied / "temperature_K=90_seed=1" / "trajectory.xtc").write_bytes(b"nothing")
+    rdf = registry.KNOWN["rdf"]
 
-    (mean,) = over_replicas(
-        [found(np.linspace(0, 4, 5), 1.0), found(np.linspace(0, 3, 7), 3.0), found(np.linspace(0, 9, 4), None)]
-    )
-    (curve,), (value,) = mean.curves, mean.values
-    assert curve.axis[1].tolist() == [0, 1, 2, 3]
-    assert curve.columns["MSD"] == pytest.approx([0, 2, 4, 6])
-    assert curve.errors["MSD"] == pytest.approx(0, abs=1e-12)
-    assert (value.value, value.error) == pytest.approx((2.0, 1.0))
-    assert "over 2 runs of 3" in value.note
-    assert mean.notes == ["note"]
-    (alone,) = over_replicas([found(np.linspace(0, 4, 5), 1.0)])
-    assert alone.values[0].error == 9.0
+    def broken(runs):
+        raise ZeroDivisionError("of no use")
+
+    monkeypatch.setitem(registry.KNOWN, "rdf", rdf._replace(function=broken))
+    assert cli.main(["analyse", str(copied), "--only", "rdf,viscosity,structure_factor"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"temperature_K=90_seed=1: skipped: .*cannot be read as a trajectory", said)
+    assert "rdf: skipped: an error of rigidmd, please report it: ZeroDivisionError: of no use (test_sweep.py:" in said
+    assert "viscosity: skipped: a viscosity needs the pressure tensor" in said
+    with (copied / "analysis.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["runs"] for row in rows] == ["1", "2"]
+    assert all(float(row["highest peak of S(k)"]) > 0 for row in rows)
+    assert (copied / "analysis.png").read_bytes().startswith(b"\x89PNG")
+    assert "analysis.png" in (copied / ".rigidmd-run").read_text()
+    assert not (copied / "temperature_K=120" / "rdf.csv").exists()
+
+
+def test_replicas_that_are_too_short_alone_are_analysed_together(copied, capsys):
+    assert cli.main(["analyse", str(copied / "temperature_K=90_seed=1"), "--only", "msd"]) == 2
+    assert "needs at least 20 frames" in capsys.readouterr().err
+    assert cli.main(["analyse", str(copied), "--only", "msd"]) == 0
+    assert (copied / "temperature_K=90" / "msd.csv").is_file()
+
+
+def test_the_density_of_an_earlier_stage_is_in_the_table(tmp_path, argon, capsys):
+    """A pair of stages, of which the first samples the density and the second keeps it."""
+    stages = """
+[[stages]]
+name = "density"
+ensemble = "npt"
+temperature_K = 90.0
+pressure_bar = 50.0
+duration_ps = 2
+timestep_fs = 5
+
+[[stages]]
+name = "production"
+ensemble = "nvt"
+temperature_K = 90.0
+duration_ps = 1
+timestep_fs = 5
+"""
+    text = ARGON.replace("[[stages]]\nduration_ps = 0.5\ntimestep_fs = 5\n", stages)
+    (scene := tmp_path / "pair.toml").write_text(text + "log_interval_ps = 0.02\n")
+    together = "stages.density.temperature_K,stages.production.temperature_K"
+    folder = tmp_path / "s"
+    with ExitStack() as stack:
+        there = sweeping.open_sweep(stack, scene, [parse_axis(f"{together}=90,110")], folder)
+        for point in there.manifest.points:
+            Simulation(Scene.read(scene, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+    assert cli.main(["sweep", str(scene), "-o", str(folder), "--collect"]) == 0
+    said = capsys.readouterr().out
+    assert "density: Density (g/mL)" in said
+    for row, point in zip(table(folder), there.manifest.points, strict=True):
+        stage = json.loads((folder / point.folder / "summary.json").read_text())["stages"][0]
+        assert float(row["density: Density (g/mL)"]) == pytest.approx(stage["density_g_cm3"], rel=1e-6)
+        if stage["density_error_g_cm3"] is not None:
+            assert float(row["density: Density (g/mL) error"]) == pytest.approx(stage["density_error_g_cm3"], rel=1e-6)
+        assert float(row["density: Temperature (K)"]) == pytest.approx(stage["temperature_K"], rel=1e-6)
+        assert "Density (g/mL) error" not in row  # it is constant in the last stage
+
+
+@pytest.mark.parametrize(
+    ("key", "together", "label"),
+    [
+        ("stages.density.temperature_K", [], "temperature of stages.density (K)"),
+        ("box.density_g_cm3", ["box.density_g_cm3"], "density of box (g/cm³)"),
+        ("stages.0.timestep_fs", ["stages.0.timestep_fs", "seed"], "timestep of stages.0 (fs)\ntogether with seed"),
+        ("molecules.0.count", [], "count of molecules.0"),
+        ("seed", [], "seed"),
+        ("stages.0.pressure_bar", [], "pressure of stages.0 (bar)"),
+    ],
+)
+def test_axes_have_units_and_name_the_keys_that_vary_together(key, together, label):
+    assert axis_label(key, together) == label
 
 
 def test_a_row_has_the_error_over_its_runs_or_that_of_its_only_run():
     assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {"x": (3.0, 0.5)}})["x"] == (2.0, pytest.approx(1.0))
     assert SweepRow({}, {1: {"x": (1.0, 0.5)}, 2: {}})["x"] == (1.0, 0.5)
-    assert SweepRow({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, 0.0)
+    assert SweepRow({}, {1: {"x": (0.1, 0.0)}, 2: {"x": (0.1, 0.0)}, 3: {"x": (0.1, 0.0)}})["x"] == (0.1, None)
 
 
 def test_bodies_and_words(tmp_path, capsys):

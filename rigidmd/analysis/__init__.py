@@ -1,11 +1,12 @@
 """Analyses of runs of molecules, as functions of results: `rigidmd.analysis.rdf(results, "OW", "OW")`.
 
 There is a function for each analysis of `rigidmd analyse --list`, and for each one added by `register`. It returns an
-`AnalysisResult`: values with errors, and curves. `start` (ps) is the first time used, by default the detected end of
-the equilibration. Other arguments are described by help() of the function. They raise OutputError.
+`AnalysisResult`: values with errors, and curves. A list of results, of replicas, is analysed together. `start` (ps) is
+the first time used, by default the detected end of the equilibration. Other arguments are described by help() of the
+function. They raise OutputError.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from inspect import Parameter, signature
 from pathlib import Path
@@ -15,6 +16,7 @@ from rigidmd.analysis import registry
 from rigidmd.analysis.registry import Analysis, register, selected
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import frames_of_results
+from rigidmd.analysis.runs import Runs
 from rigidmd.run.results import Results
 
 registry.load_built_in()
@@ -38,25 +40,30 @@ def __dir__() -> list[str]:
 
 
 def _check_results(results: object, name: str) -> None:
-    """Raise TypeError for anything but the results of one run."""
-    if isinstance(results, Results):
+    """Raise TypeError for anything but the results of a run, or a list of them."""
+    each = results if isinstance(results, list | tuple) else [results]
+    if each and all(isinstance(one, Results) for one in each):
         return
     of = f"rigidmd.analysis.{name}"
     if isinstance(results, str | Path):
         raise TypeError(f"{of} takes the results of a run, not its path: {of}(rigidmd.read_run({str(results)!r}))")
-    of_sweep = "; of a sweep give the results of each run, rigidmd.read_run(path) for the paths in table.runs.values()"
-    raise TypeError(f"{of} takes the results of one run, not {results!r:.80}{of_sweep}")
+    of_sweep = "; of a sweep give a list of rigidmd.read_run(path) for the paths in table.runs.values()"
+    raise TypeError(f"{of} takes the results of a run, or a list of them, not {results!r:.80}{of_sweep}")
 
 
 @cache
 def _function_of_results(entry: Analysis) -> Callable[..., AnalysisResult]:
     """The function of frames as one of results, with its other parameters and its docstring."""
 
-    def function(results: Results, *arguments: Any, start: float | None = None, **options: Any) -> AnalysisResult:
+    def function(
+        results: Results | Sequence[Results], *arguments: Any, start: float | None = None, **options: Any
+    ) -> AnalysisResult:
         _check_results(results, entry.name)
-        if start not in results._analysis_frames:
-            results._analysis_frames[start] = frames_of_results(results, start)
-        return entry.function(results._analysis_frames[start], *arguments, **options)
+        each = [results] if isinstance(results, Results) else results
+        for one in each:
+            if start not in one._analysis_frames:
+                one._analysis_frames[start] = frames_of_results(one, start)
+        return entry.function(Runs(tuple(one._analysis_frames[start] for one in each)), *arguments, **options)
 
     ours, (_, *more) = signature(function), signature(entry.function).parameters.values()
     given = [ours.parameters["results"], *more, ours.parameters["start"]]

@@ -1,6 +1,7 @@
 """Analyses of the folder of a run, and their files: analysis.json, a CSV file and a figure for each curve."""
 
 import csv
+import traceback
 from collections.abc import Callable
 from functools import partial
 from inspect import signature
@@ -13,6 +14,7 @@ from rigidmd.analysis.curve_figure import curve_figure
 from rigidmd.analysis.registry import analysis_order, is_built_in, selected
 from rigidmd.analysis.result import AnalysisResult, Curve, Value
 from rigidmd.analysis.rigid_frames import frames_of_folder
+from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.errors import OutputError
 from rigidmd.figures.style import write_figure
 from rigidmd.io.folder import add_to_folder, written_by_runs
@@ -138,7 +140,7 @@ READING = 0.25  # fraction of the progress for reading frames
 
 
 class AnalysisOutput(NamedTuple):
-    """failed : analysis -> why it has failed, if it was not requested by name; frames_used : for analysis.json"""
+    """failed : analysis -> why it has failed; frames_used : for analysis.json"""
 
     frames_used: dict[str, Any]  # stage, times (ps) from which and to which, number, notes
     results: list[AnalysisResult]
@@ -154,33 +156,79 @@ def analyse_folder(
     progress: Callable[[float, str], object] = lambda fraction, name: None,
     figures: str = FIGURES[0],
 ) -> AnalysisOutput:
-    """Analyse the run in a folder and write the files into it. Raises OutputError.
+    """Analyse the run in a folder and write the files into it.
 
-    An analysis that is not possible is left out with a sentence, unless it was requested by name.
+    An analysis that is not possible is left out with a sentence. Raises OutputError if none is possible.
 
     names : of analyses, all if empty; start : of the frames, ps; viscosity : mPa s
     progress : called with the fraction done and the name of the present work
     figures : type of the figures, one of FIGURES
     """
-    entries = selected(names)
+    selected(names)  # before frames are read
     reading = lambda fraction: progress(READING * fraction, "reading frames")  # noqa: E731
     reading(0.0)
     frames = frames_of_folder(read_record(folder), start, reading)
-    results, failed = [], {}
-    for k, entry in enumerate(entries):
-        progress(READING + (1 - READING) * k / len(entries), entry.name)
-        takes_viscosity = "viscosity_mPa_s" in signature(entry.function).parameters
-        try:
-            results.append(entry.function(frames, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {}))
-        except OutputError as error:
-            if names:
-                raise OutputError(f"{folder}: {error}") from None
-            failed[entry.name] = str(error)
-    if not results:
-        raise OutputError(f"{folder}: no analysis is possible: {'; '.join(failed.values())}")
-    time = frames.time
-    used = {"stage": frames.stage.label, "from_ps": float(time[0]), "to_ps": float(time[-1]), "frames": len(time)}
-    used |= {"notes": frames.notes}
-    files = write_results(folder, used, results, failed, figures)
+    rest = lambda fraction, name: progress(READING + (1 - READING) * fraction, name)  # noqa: E731
+    done = analyse_frames(folder, as_runs(frames), names, viscosity, rest, figures)
+    if not done.results:
+        raise OutputError(f"{folder}: {no_result_reason(done.failed)}")
+    return done
+
+
+def analyse_frames(
+    folder: Path,
+    runs: Runs,
+    names: list[str],
+    viscosity: float | None,
+    progress: Callable[[float, str], object],
+    figures: str,
+) -> AnalysisOutput:
+    """Analyse frames, and write the files into a folder if there are results. See `analyse_folder`."""
+    results, failed = run_analyses(runs, names, viscosity, progress)
+    used = {
+        "stage": runs.first.stage.label,
+        "from_ps": min(float(run.time[0]) for run in runs.members),
+        "to_ps": max(float(run.time[-1]) for run in runs.members),
+        "frames": runs.frame_count,
+        "notes": runs.first.notes,
+    }
+    if runs.are_several:
+        used["notes"] = [f"averages over {len(runs.members)} runs together, errors from their scatter"]
+    files = write_results(folder, used, results, failed, figures) if results else []
     progress(1.0, "")
     return AnalysisOutput(used, results, failed, files)
+
+
+def run_analyses(
+    runs: Runs,
+    names: list[str],
+    viscosity: float | None = None,
+    progress: Callable[[float, str], object] = lambda fraction, name: None,
+) -> tuple[list[AnalysisResult], dict[str, str]]:
+    """The results of analyses, and a sentence on each that has failed: analysis -> why. No analysis ends the others."""
+    entries = selected(names)
+    results, failed = [], {}
+    for k, entry in enumerate(entries):
+        progress(k / len(entries), entry.name)
+        takes_viscosity = "viscosity_mPa_s" in signature(entry.function).parameters
+        try:
+            results.append(entry.function(runs, **{"viscosity_mPa_s": viscosity} if takes_viscosity else {}))
+        except OutputError as error:
+            failed[entry.name] = str(error)
+        except Exception as error:  # an error of rigidmd, which should not cost the results of other analyses
+            failed[entry.name] = _unexpected(error)
+    return results, failed
+
+
+def no_result_reason(failed: dict[str, str]) -> str:
+    """Why no analysis has a result."""
+    reasons = "; ".join(dict.fromkeys(failed.values()))
+    return reasons if len(failed) == 1 else f"no analysis is possible: {reasons}"
+
+
+def _unexpected(error: Exception) -> str:
+    """An exception with its type and the line that raised it."""
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"an error of rigidmd, please report it: {type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
+    )

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value
+from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value, correlation_time_of, mean_of_series
 from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import unreadable_reason
-from rigidmd.core.statistics import correlation_time, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.scene.validation import did_you_mean
 
@@ -35,11 +35,15 @@ KNOWN: dict[str, Analysis] = {}
 
 
 def built_in(about: str, position: float = inf) -> Callable[[Function], Function]:
-    """Register a built-in analysis under the name of its function."""
+    """Register a built-in analysis under the name of its function of `Runs`, which takes the frames of one run too."""
 
     def add(function: Function) -> Function:
-        KNOWN[function.__name__] = Analysis(function.__name__, about, function, position, False)
-        return function
+        @wraps(function)
+        def analysis(frames: RigidFrames | Runs, *arguments: Any, **options: Any) -> AnalysisResult:
+            return function(as_runs(frames), *arguments, **options)
+
+        KNOWN[function.__name__] = Analysis(function.__name__, about, analysis, position, False)
+        return analysis
 
     return add
 
@@ -72,25 +76,26 @@ def register(function: Callable[[RigidFrames], Any]) -> Callable[[RigidFrames], 
     about = ((function.__doc__ or "").strip().splitlines() or [name])[0]
 
     @wraps(function)
-    def analysis(frames: RigidFrames) -> AnalysisResult:
+    def analysis(frames: RigidFrames | Runs) -> AnalysisResult:
         """Means and errors of its values."""
-        try:
-            found = function(frames)
-        except (Exception, SystemExit) as error:  # a user's function may raise anything
-            raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
-        series = dict(found) if isinstance(found, Mapping) else {name: found}
-        if not series:
-            raise OutputError(f"the analysis {name} returned an empty dictionary")
-        columns = {str(title): _checked_series(name, title, given, len(frames)) for title, given in series.items()}
-        values = []
-        for title, array in columns.items():
-            value, error = mean_and_error(array)
-            if np.ptp(array) == 0 or value is None:
-                values.append(Value(title, "", float(array[0]), 0.0))
+        runs = as_runs(frames)
+        every = [_series_of(function, name, run) for run in runs.members]
+        columns = {title: [of_run[title] for of_run in every if title in of_run] for title in every[0]}
+        found = AnalysisResult(name, about)
+        for title, series in columns.items():
+            if len(series) < len(every):
+                raise OutputError(f"the analysis {name} returned {title!r} for some of the runs only")
+            value, error = mean_of_series(runs, series)
+            if max(map(np.ptp, series)) == 0 and not error:
+                found.values.append(Value(title, "", value, None))  # a constant
             else:
-                tau = correlation_time(array, frames.span / (len(frames) - 1))
-                values.append(converged_value(title, "", value, error, frames.span, tau))
-        return AnalysisResult(name, about, values, [Curve(name, ("Time (ps)", frames.time), about, columns)])
+                tau = correlation_time_of(runs, series)
+                found.values.append(converged_value(title, "", value, error, runs.span, tau))
+        shown = {
+            title: np.mean([values[: runs.shortest] for values in series], axis=0) for title, series in columns.items()
+        }
+        found.curves.append(Curve(name, ("Time (ps)", runs.first.time[: runs.shortest]), about, shown))
+        return found
 
     KNOWN[name] = Analysis(name, about, analysis, inf, True)
     return function
@@ -127,6 +132,19 @@ def run_user_file(path: Path) -> None:
         raise OutputError(f"{path} raised {type(error).__name__}: {error}") from error
     if not any(entry.is_user and entry is not before.get(name) for name, entry in KNOWN.items()):
         raise OutputError(f"{path} defines no analysis: put @rigidmd.analysis.register before a function of frames")
+
+
+def _series_of(function: Callable[[RigidFrames], Any], name: str, frames: RigidFrames) -> dict[str, np.ndarray]:
+    """What a user-defined analysis returns for the frames of a run: a number for each frame (f,) by title. Raises
+    OutputError."""
+    try:
+        found = function(frames)
+    except (Exception, SystemExit) as error:  # a user's function may raise anything
+        raise OutputError(f"the analysis {name} raised {type(error).__name__}: {error}") from error
+    series = dict(found) if isinstance(found, Mapping) else {name: found}
+    if not series:
+        raise OutputError(f"the analysis {name} returned an empty dictionary")
+    return {str(title): _checked_series(name, title, given, len(frames)) for title, given in series.items()}
 
 
 def _checked_series(name: str, title: object, given: Any, count: int) -> np.ndarray:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.runs import Measured, Runs
 from rigidmd.core.display import Displayed
-from rigidmd.core.statistics import error_of_mean, format_with_error
+from rigidmd.core.statistics import correlation_time, error_of_mean, format_with_error, mean_and_error
 from rigidmd.io.run_files import Bounded
 from rigidmd.run.rigid_fit import Kind
 
@@ -24,7 +25,6 @@ MAX_GROUPS = 10  # groups of molecules at most, whose scatter gives errors too
 #: Least length of a run for a value in correlation times of the whole system. For those of single molecules, of which
 #: there are many, it is `BLOCKS`, because each block should be one correlation time long.
 MIN_CORRELATION_TIMES = 20.0
-Measured = tuple[np.ndarray, np.ndarray]  # an array and its standard error
 
 
 class Value(NamedTuple):
@@ -188,19 +188,60 @@ def converged_value(
     return Value(name, unit, value, error, correlation, note)
 
 
-def with_block_error(frames: RigidFrames, function: Callable[[RigidFrames], np.ndarray]) -> Measured:
-    """An array computed from frames, and its standard error from blocks of at least two of them."""
-    whole, size = np.asarray(function(frames), float), len(frames) // BLOCKS
+Array = Callable[[np.ndarray], np.ndarray]
+
+
+def _unchanged(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def with_block_error(
+    runs: Runs, measure: Callable[[RigidFrames], np.ndarray], conclude: Array = _unchanged
+) -> Measured:
+    """An array computed from frames, and its standard error: of one run from blocks of at least two frames, of
+    several from their scatter.
+
+    measure : means over some frames; conclude : function of the means over all of them
+    """
+    if runs.are_several:
+        return runs.estimate([measure(run) for run in runs.members], conclude)
+    frames = runs.first
+    whole, size = np.asarray(conclude(measure(frames)), float), len(frames) // BLOCKS
     blocks = range(len(frames) - size * BLOCKS, len(frames), size) if size > 1 else ()
-    parts = [np.asarray(function(frames[k : k + size]), float) for k in blocks]
+    parts = [np.asarray(conclude(measure(frames[k : k + size])), float) for k in blocks]
     return whole, error_of_mean(parts) if parts else np.full_like(whole, np.nan)
 
 
-def with_group_error(frames: RigidFrames, kind: Kind, function: Callable[[RigidFrames, Kind], np.ndarray]) -> Measured:
-    """An array computed from the molecules of a species, and its standard error: the larger of two, from blocks of
-    frames and from groups of molecules. Blocks are too similar in a gas, groups where molecules move together."""
-    whole, error = with_block_error(frames, lambda part: function(part, kind))
-    if (count := min(MAX_GROUPS, len(kind.index))) > 1:
+def with_group_error(
+    runs: Runs, kind: Kind, measure: Callable[[RigidFrames, Kind], np.ndarray], conclude: Array = _unchanged
+) -> Measured:
+    """An array computed from the molecules of a species, and its standard error: of one run the larger of two, from
+    blocks of frames and from groups of molecules; of several runs from their scatter. Blocks are too similar in a gas,
+    groups where molecules move together."""
+    whole, error = with_block_error(runs, lambda part: measure(part, kind), conclude)
+    if (count := min(MAX_GROUPS, len(kind.index))) > 1 and not runs.are_several:
         groups = (kind._replace(index=kind.index[k::count], sites=kind.sites[k::count]) for k in range(count))
-        error = np.fmax(error, error_of_mean([function(frames, group) for group in groups]))
+        error = np.fmax(error, error_of_mean([conclude(measure(runs.first, group)) for group in groups]))
     return whole, error
+
+
+def mean_of_series(runs: Runs, series: list[np.ndarray]) -> tuple[float, float | None]:
+    """Mean of a number for each frame, and its standard error.
+
+    series : the numbers (f,) of each run
+    """
+    if runs.are_several:
+        value, error = runs.estimate([values.mean() for values in series], _unchanged)
+        return float(value), float(error)
+    value, error = mean_and_error(series[0])
+    return (float(series[0].mean()) if value is None else value), error
+
+
+def correlation_time_of(runs: Runs, series: list[np.ndarray]) -> float:
+    """Correlation time (ps) of a number for each frame, mean over runs.
+
+    series : the numbers (f,) of each run
+    """
+    pairs = zip(series, runs.members, strict=True)
+    found = [correlation_time(values, run.span / (len(run) - 1)) for values, run in pairs]
+    return float(runs.mean(found))

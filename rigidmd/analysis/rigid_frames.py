@@ -3,7 +3,7 @@
 They are from the folder of a run or from results in memory, by default from where production begins.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -58,6 +58,12 @@ class RigidFrames:
 
     def __repr__(self) -> str:
         return f"<RigidFrames: {len(self)} frames over {self.span:g} ps>"
+
+    @property
+    def size(self) -> int:
+        """Number of numbers in the arrays of frames."""
+        arrays = (self.cell, self.positions, self.Q, self.velocities, self.L)
+        return sum(array.size for array in arrays if array is not None)
 
     @property
     def span(self) -> float:
@@ -138,6 +144,16 @@ class RigidFrames:
             velocities=None if self.velocities is None else self.velocities[frames],
             L=None if self.L is None else self.L[frames],
         )  # fmt: skip
+
+    def copied(self) -> "RigidFrames":
+        """These frames in memory of their own, so that the frames of which they are a part can be freed."""
+        return replace(
+            self,
+            positions=self.positions.copy(),
+            Q=self.Q.copy(),
+            velocities=None if self.velocities is None else self.velocities.copy(),
+            L=None if self.L is None else self.L.copy(),
+        )
 
 
 def sites_named(molecule: Molecule, name: str) -> list[int]:
@@ -237,6 +253,22 @@ def production_samples(record: Record) -> tuple[Stage, np.ndarray]:
     stage, _, last, begin, shown = _last_stage(record.system, record.columns)
     time = record.columns["time"]
     return stage, shown & (time >= begin) & (time <= last)
+
+
+def earlier_production(record: Record) -> Iterator[tuple[Stage, np.ndarray]]:
+    """The stages of motion before the last one whose set points do not change, and which samples are of the
+    equilibrated part of each. Raises OutputError."""
+    columns, last = record.columns, _last_stage(record.system, record.columns)[0]
+    for k, stage in enumerate(record.system.scene.stages):
+        if stage is last:
+            return
+        of_stage = np.flatnonzero(columns["stage"] == k)
+        if stage.is_minimisation or stage.ramps or not len(of_stage):
+            continue
+        start = equilibrated_from({name: values[of_stage] for name, values in columns.items()}, stage)
+        samples = np.zeros(len(columns["stage"]), bool)
+        samples[of_stage[start:]] = True
+        yield stage, samples
 
 
 def _rigid_frames(

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from rigidmd.commands import FAILED
 from rigidmd.commands.arguments import Options, argument, command, number, time_ps
 from rigidmd.commands.streams import progress_bar
 
@@ -52,14 +53,15 @@ def _analyse(options: Options) -> int:
             progress(1.0, "")
             for of in found:
                 runs = f"{of.runs} run{'s' if of.runs > 1 else ''}"
-                print(f"{of.title or folder}: {runs}, {len(of.files)} files in {of.files[0].parent}")
+                files = f"{len(of.files)} files in {of.files[0].parent}" if of.files else "no results"
+                print(f"{of.title or folder}: {runs}, {files}")
                 _print_results(of.results, of.failed)
                 print()
             print(f"values of all in {folder / ANALYSES}")
             if options.extrapolate is not None:
                 names = print_limits(folder, read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
-            return 0
+            return FAILED if options.only and any(of.failed for of in found) else 0
         if options.extrapolate is not None:
             raise OutputError(f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run")
         done = analyse_folder(folder, *request, progress, options.figures)
@@ -69,7 +71,7 @@ def _analyse(options: Options) -> int:
         print(f"  {note}")
     _print_results(done.results, done.failed)
     print(f"{len(done.files)} files in {options.folder}, values in {done.files[0].name}; `rigidmd report` shows them")
-    return 0
+    return FAILED if options.only and done.failed else 0
 
 
 def _print_results(results: list, skipped: dict[str, str]) -> None:

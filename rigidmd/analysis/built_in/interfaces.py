@@ -7,10 +7,20 @@ import numpy as np
 from scipy import optimize
 
 from rigidmd.analysis.registry import built_in
-from rigidmd.analysis.result import AnalysisResult, Curve, Value, converged_value, with_block_error
+from rigidmd.analysis.result import (
+    AnalysisResult,
+    Curve,
+    Value,
+    converged_value,
+    correlation_time_of,
+    mean_of_series,
+    too_short,
+)
 from rigidmd.analysis.rigid_frames import RigidFrames
+from rigidmd.analysis.runs import Runs
 from rigidmd.core.statistics import correlation_time, mean_and_error
 from rigidmd.errors import OutputError
+from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import BAR, GRAM_PER_CM3
 
 #: mN/m in u/ps².
@@ -66,15 +76,11 @@ def profile(z: np.ndarray, liquid: float, vapour: float, half: float, width: flo
     return 0.5 * (liquid + vapour) - 0.5 * (liquid - vapour) * np.tanh((z - half) / width)
 
 
-def fitted(slab: Slab) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parameters of `profile` (densities in g/cm³, lengths in Å), distances and densities. Raises OutputError."""
-    bins = max(8, int(slab.height / 2 / BIN))
-    edges = np.linspace(0.0, slab.height / 2, bins + 1)
-    z, weights = 0.5 * (edges[1:] + edges[:-1]), np.broadcast_to(slab.mass, slab.distance.shape)
-    mass = np.histogram(np.abs(slab.distance), edges, weights=weights)[0] / len(slab.distance)
-    density = mass / (2 * slab.area * np.diff(edges)) / GRAM_PER_CM3
-    top, low = float(np.quantile(density, 0.95)), float(density[-bins // 5 :].mean())
-    half = float(np.sum(density - low) * (edges[1] - edges[0]) / max(top - low, 1e-9 * top))
+def fitted(z: np.ndarray, density: np.ndarray, height: float) -> np.ndarray:
+    """Parameters of `profile` (densities in g/cm³, lengths in Å) for densities (bins,) at distances z in a box of this
+    height. Raises OutputError."""
+    top, low = float(np.quantile(density, 0.95)), float(density[-len(z) // 5 :].mean())
+    half = float(np.sum(density - low) * (z[1] - z[0]) / max(top - low, 1e-9 * top))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", optimize.OptimizeWarning)
@@ -82,23 +88,67 @@ def fitted(slab: Slab) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     except (RuntimeError, optimize.OptimizeWarning):
         raise OutputError("the density has no profile of a slab between two vapours") from None
     liquid, vapour, half, width = found
-    if not (vapour < LARGEST_RATIO * liquid and abs(width) < half < slab.height / 2 - abs(width)):
+    if not (vapour < LARGEST_RATIO * liquid and abs(width) < half < height / 2 - abs(width)):
         raise OutputError("the box has no slab between two vapours along this axis")
-    return np.array([liquid, vapour, half, abs(width)]), z, density
+    return np.array([liquid, vapour, half, abs(width)])
+
+
+class Profiles(NamedTuple):
+    """Densities of slabs at distances from their middles, mean of both sides."""
+
+    slabs: list[Slab]  # of each run
+    height: float  # of the box along the normal, Å
+    z: np.ndarray  # (bins,) Å
+    densities: list[np.ndarray]  # (f, bins) in each frame of each run, g/cm³
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Edges of the bins (bins + 1,), Å."""
+        return np.linspace(0.0, self.height / 2, len(self.z) + 1)
+
+
+def profiles_of(runs: Runs, axis: str) -> Profiles:
+    """The profiles of a slab in all frames. Raises OutputError."""
+    slabs = [slab_of(run, axis) for run in runs.members]
+    height = float(runs.mean([slab.height for slab in slabs]))
+    bins = max(8, int(height / 2 / BIN))
+    edges = np.linspace(0.0, height / 2, bins + 1)
+    densities = []
+    for slab in slabs:
+        volume = 2 * slab.area * np.diff(edges)
+        masses = [np.histogram(np.abs(frame), edges, weights=slab.mass)[0] for frame in slab.distance]
+        densities.append(np.array(masses) / volume / GRAM_PER_CM3)
+    return Profiles(slabs, height, 0.5 * (edges[1:] + edges[:-1]), densities)
+
+
+def _changes_of_fit(z: np.ndarray, densities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Parameters (f, 4) that follow to first order from the densities (f, bins) of each frame."""
+    steps = 1e-6 * np.maximum(np.abs(parameters), 1e-3)
+    shifted = [(profile(z, *(parameters + step)), profile(z, *(parameters - step))) for step in np.diag(steps)]
+    slopes = np.array([(after - before) / (2 * step) for (after, before), step in zip(shifted, steps, strict=True)]).T
+    return parameters + (densities - profile(z, *parameters)) @ np.linalg.pinv(slopes).T
 
 
 @built_in("interfaces of a slab: coexisting densities, width, orientation", position=32)
-def interfaces(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
+def interfaces(runs: Runs, axis: str = "z") -> AnalysisResult:
     """Densities of liquid and vapour, thickness of the slab and width of its interfaces, from a fit of
 
     rho(z) = (rho_l + rho_v)/2 - (rho_l - rho_v)/2 tanh((z - z0)/d)
 
-    to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982). Errors are from
-    blocks. The curve also has the mean cosine of dipoles with the outward normal. Raises OutputError.
+    to the profile about the middle of the slab, averaged over both sides (Rowlinson & Widom 1982). Errors of one run
+    are from the correlated series of what each frame changes in the fit. The curve also has the mean cosine of dipoles
+    with the outward normal. Raises OutputError.
     """
-    slab = slab_of(frames, axis)
-    _, z, density = fitted(slab)
-    whole, errors = with_block_error(frames, lambda part: fitted(slab_of(part, axis))[0])
+    seen = profiles_of(runs, axis)
+    means = [densities.mean(axis=0) for densities in seen.densities]
+    density = runs.mean(means)
+    whole = fitted(seen.z, density, seen.height)
+    series = [_changes_of_fit(seen.z, densities, whole) for densities in seen.densities]
+    errors: list[float | None]
+    if runs.are_several:
+        errors = runs.estimate(means, lambda mean: fitted(seen.z, mean, seen.height))[1].tolist()
+    else:
+        errors = [mean_and_error(values)[1] for values in series[0].T]
     names = (
         ("liquid", "g/cm³", 1.0),
         ("vapour", "g/cm³", 1.0),
@@ -106,64 +156,79 @@ def interfaces(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
         ("width d", "Å", 1.0),
     )
     found = AnalysisResult("interfaces", f"interfaces of a slab across {axis}")
-    for (name, unit, factor), value, error in zip(names, whole, errors, strict=True):
+    for k, (name, unit, factor) in enumerate(names):
         note = "from 10 to 90 % of the density it is 2.197 d" if name == "width d" else ""
-        found.values.append(Value(name, unit, factor * value, factor * error, None, note))
-    curve = Curve("interfaces", ("distance from the middle (A)", z), "density (g/cm³)", {"density (g/cm3)": density})
-    curve.columns["fit (g/cm3)"] = profile(z, *whole)
+        error = None if errors[k] is None else factor * float(errors[k] or 0.0)
+        tau = correlation_time_of(runs, [of_run[:, k] for of_run in series])
+        if error is None:
+            found.values.append(too_short(name, unit, factor * float(whole[k]), None, "too short for an error", tau))
+        else:
+            found.values.append(Value(name, unit, factor * float(whole[k]), error, tau, note))
+    axis_of_curve = ("distance from the middle (A)", seen.z)
+    curve = Curve("interfaces", axis_of_curve, "density (g/cm³)", {"density (g/cm3)": density})
+    curve.columns["fit (g/cm3)"] = profile(seen.z, *whole)
     found.curves.append(curve)
-    edges = np.linspace(0.0, slab.height / 2, len(z) + 1)
-    for kind in frames.kinds:
-        if kind.molecule.has_dipole and frames.Q.shape[1]:
-            dipole = kind.molecule.charges @ kind.molecule.positions_body
-            cosine = frames.Q[:, kind.index, slab.axis] @ (dipole / np.linalg.norm(dipole))
-            at = slab.centre[:, kind.index]
-            count = np.histogram(np.abs(at), edges)[0]
-            total = np.histogram(np.abs(at), edges, weights=cosine * np.sign(at))[0]
-            known = count > FEWEST * count.max()
-            mean = np.divide(total, count, out=np.full(len(z), np.nan), where=known)
+    for kind in runs.kinds:
+        if kind.molecule.has_dipole and runs.has_rotations:
+            mean = _mean_cosine(runs, seen, kind)
             title = f"mean cosine of dipoles {kind.name}"
             found.curves.append(Curve(f"dipoles_{kind.name}", curve.axis, "mean cosine", {title: mean}, level=0.0))
     return found
 
 
+def _mean_cosine(runs: Runs, seen: Profiles, kind: Kind) -> np.ndarray:
+    """Mean cosine (bins,) of the dipoles of a species with the outward normal; NaN where there are few."""
+    dipole = kind.molecule.charges @ kind.molecule.positions_body
+    count, total = np.zeros(len(seen.z)), np.zeros(len(seen.z))
+    for run, slab in zip(runs.members, seen.slabs, strict=True):
+        cosine = run.Q[:, kind.index, slab.axis] @ (dipole / np.linalg.norm(dipole))
+        at = slab.centre[:, kind.index]
+        count += np.histogram(np.abs(at), seen.edges)[0]
+        total += np.histogram(np.abs(at), seen.edges, weights=cosine * np.sign(at))[0]
+    return np.divide(total, count, out=np.full(len(seen.z), np.nan), where=count > FEWEST * count.max())
+
+
 @built_in("surface tension of a slab from the pressure tensor", position=105)
-def surface_tension(frames: RigidFrames, axis: str = "z") -> AnalysisResult:
+def surface_tension(runs: Runs, axis: str = "z") -> AnalysisResult:
     """Surface tension (mN/m) of the two interfaces of a slab: L/2 <P_N - P_T> (Kirkwood & Buff 1949), with the edge L
     and the pressure P_N along the normal, and the mean pressure P_T across it. Raises OutputError."""
-    slab = slab_of(frames, axis)
-    fitted(slab)
+    seen = profiles_of(runs, axis)
+    fitted(seen.z, runs.mean([densities.mean(axis=0) for densities in seen.densities]), seen.height)
+    samples = [_tension_of(run, slab) for run, slab in zip(runs.members, seen.slabs, strict=True)]
+    series = [values for _, values in samples]
+    value, error = mean_of_series(runs, series)
+    spans = [float(time[-1] - time[0]) for time, _ in samples]
+    of_runs = [correlation_time(values, span / (len(values) - 1)) for values, span in zip(series, spans, strict=True)]
+    fewest = min(map(len, series))
+    running = np.mean([np.cumsum(values[:fewest]) for values in series], axis=0) / np.arange(1, fewest + 1)
+    some = np.unique(np.linspace(fewest // 20, fewest - 1, 500).astype(int))
+    found = AnalysisResult("surface_tension", f"surface tension across {axis}")
+    time, title = ("Time (ps)", samples[0][0][some]), "running mean (mN/m)"
+    found.curves.append(Curve("surface_tension", time, title, {title: running[some]}))
+    is_cut = runs.system.scene.forces.dispersion == "cutoff"
+    note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
+    tau = float(np.mean(of_runs))
+    found.values.append(converged_value("surface tension", "mN/m", value, error, sum(spans), tau, note))
+    return found
+
+
+def _tension_of(frames: RigidFrames, slab: Slab) -> tuple[np.ndarray, np.ndarray]:
+    """Times (l,), ps, and surface tensions (l,), mN/m. Raises OutputError."""
     time, pressure = _pressures(frames)
     if len(time) < 2:
         raise OutputError("a surface tension needs samples of the pressure tensor: there are fewer than two")
     normal = pressure[slab.axis]
-    series = 0.5 * slab.height * 1.5 * (normal - pressure.mean(axis=0)) * BAR / MN_PER_M
-    value, error = mean_and_error(series)
-    assert value is not None  # there are samples
-    span = float(time[-1] - time[0])
-    tau = correlation_time(series, span / (len(time) - 1))
-    running = np.cumsum(series) / np.arange(1, len(series) + 1)
-    some = np.unique(np.linspace(len(series) // 20, len(series) - 1, 500).astype(int))
-    found = AnalysisResult("surface_tension", f"surface tension across {axis}")
-    found.curves.append(
-        Curve(
-            "surface_tension", ("Time (ps)", time[some]), "running mean (mN/m)", {"running mean (mN/m)": running[some]}
-        )
-    )
-    is_cut = frames.system.scene.forces.dispersion == "cutoff"
-    note = "of the forces in the run: without dispersion beyond the cutoff" if is_cut else ""
-    found.values.append(converged_value("surface tension", "mN/m", value, error, span, tau, note))
-    return found
+    return time, 0.5 * slab.height * 1.5 * (normal - pressure.mean(axis=0)) * BAR / MN_PER_M
 
 
 def _pressures(frames: RigidFrames) -> tuple[np.ndarray, np.ndarray]:
     """Times (l,), ps, and diagonal of the pressure tensor (3, l), bar, from its file or the log. Raises OutputError."""
     if frames.tensor is not None:
         return frames.tensor[:, 0], frames.tensor[:, 1:4].T
-    names = [f"pressure_{x}{x}" for x in "xyz"]
-    if not all(name in frames.columns for name in names):
+    found = [frames.columns.get(f"pressure_{x}{x}") for x in "xyz"]
+    if any(column is None or not np.isfinite(column).all() for column in found):
         raise OutputError(
             "a surface tension needs the pressure tensor, which this run did not write: set "
             "output.pressure_tensor_interval_ps = 0.05, or output.pressure_tensor = true"
         )
-    return frames.columns["time"], np.array([frames.columns[name] for name in names])
+    return frames.columns["time"], np.array(found)

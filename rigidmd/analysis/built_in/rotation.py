@@ -10,9 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from rigidmd.analysis.built_in.transport import correlation, interval_and_lags, squared_displacement
 from rigidmd.analysis.registry import built_in
-from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, converged_value, too_short, with_group_error
+from rigidmd.analysis.result import (
+    BLOCKS,
+    AnalysisResult,
+    Curve,
+    Value,
+    converged_value,
+    correlation_time_of,
+    mean_of_series,
+    too_short,
+    with_group_error,
+)
 from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.core.statistics import correlation_time, mean_and_error
+from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
 from rigidmd.io.formats import written
 from rigidmd.mechanics.inertia import rotational_freedom
@@ -35,15 +45,15 @@ def _axes(kind: Kind) -> list[int]:
 
 
 @built_in("orientational correlation C1 and C2 about each body axis, and rotational diffusion", position=70)
-def orientation(frames: RigidFrames) -> AnalysisResult:
+def orientation(runs: Runs) -> AnalysisResult:
     """C_l(t) = <P_l(u(0)·u(t))>, l = 1, 2, of principal axes u, correlation times (ps), rotational diffusion (1/ps).
 
     Axes are those of `rigidmd models NAME`, ascending in inertia; a linear molecule has one. Rotational diffusion is
     the slope of the mean squared rotation about an axis of the body, summed over frames. Raises OutputError.
     """
-    if not (kinds := [kind for kind in frames.moving if kind.molecule.degrees_of_freedom > 3]):
+    if not (kinds := [kind for kind in runs.moving if kind.molecule.degrees_of_freedom > 3]):
         raise OutputError("no molecule of this run rotates")
-    interval, lags = interval_and_lags(frames, "an orientational correlation")
+    interval, lags = interval_and_lags(runs, "an orientational correlation")
     time = interval * np.arange(lags)
     found = AnalysisResult("orientation", "orientational correlation")
     curve = Curve("orientation", ("Time (ps)", time), "C(t)", {}, level=0.0)
@@ -54,15 +64,17 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
         for axis in _axes(kind):
 
             def compute(part: RigidFrames, group: Kind, axis=axis) -> np.ndarray:
-                """C1 and C2 of this axis, each followed by its integral (2, lags + 1)."""
+                """C1 and C2 of this axis (2, lags)."""
                 u = part.Q[..., axis][:, group.index]
                 first = 3 * correlation(u, lags)
                 squares = np.stack([u[..., i] * u[..., i] for i in range(3)], axis=-1)
                 mixed = np.stack([u[..., i] * u[..., (i + 1) % 3] for i in range(3)], axis=-1)
                 second = 1.5 * 3 * (correlation(squares, lags) + 2 * correlation(mixed, lags)) - 0.5
-                return np.stack([np.append(c, _integral(c, interval)) for c in (first, second)])
+                return np.stack([first, second])
 
-            values, errors = with_group_error(frames, kind, compute)
+            values, errors = with_group_error(
+                runs, kind, compute, lambda both: np.stack([np.append(c, _integral(c, interval)) for c in both])
+            )
             for l in (0, 1):  # noqa: E741
                 C, doubt = values[l, :-1], errors[l, :-1]
                 curve.add(f"C{l + 1} {kind.name} axis {axis + 1}", C, doubt)
@@ -81,8 +93,8 @@ def orientation(frames: RigidFrames) -> AnalysisResult:
                 low, note = int(C.argmin()), ""
                 if C[low] < -max(TAIL, 3 * float(np.nan_to_num(doubt[low]))):
                     note = f"to where C{l + 1} first falls below {TAIL:g}; at {time[low]:.3g} ps it is {C[low]:.2f}"
-                found.values.append(converged_value(name, "ps", tau, error, frames.span, tau, note, BLOCKS))
-        found.values += _rotational_diffusion(frames, kind, interval, lags)
+                found.values.append(converged_value(name, "ps", tau, error, runs.span, tau, note, BLOCKS))
+        found.values += _rotational_diffusion(runs, kind, interval, lags)
     return found
 
 
@@ -114,11 +126,11 @@ def _rotations(frames: RigidFrames, kind: Kind) -> np.ndarray:
     return Rotation.from_matrix(between.reshape(-1, 3, 3)).as_rotvec().reshape(*between.shape[:2], 3)
 
 
-def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags: int) -> list[Value]:
+def _rotational_diffusion(runs: Runs, kind: Kind, interval: float, lags: int) -> list[Value]:
     if len(_axes(kind)) == 1:
         return []
-    rotations = _rotations(frames, kind)
-    rms = float(np.sqrt(np.mean(np.sum(rotations**2, axis=-1))))
+    squares = [np.mean(np.sum(_rotations(run, kind) ** 2, axis=-1)) for run in runs.members]
+    rms = float(np.sqrt(runs.mean(squares)))
     names = [f"D_rot of {kind.name}, axis {k + 1}" for k in range(3)]
     if rms > LARGEST_ROTATION:
         note = f"molecules rotate by {np.degrees(rms):.0f}° between frames, every {interval:g} ps: write more of them"
@@ -132,35 +144,35 @@ def _rotational_diffusion(frames: RigidFrames, kind: Kind, interval: float, lags
         seen = np.stack([squared_displacement(path[..., k : k + 1], lags)[first:] for k in range(3)], axis=1)
         return (time - time.mean()) @ seen / np.sum((time - time.mean()) ** 2) / 2
 
-    values, errors = with_group_error(frames, kind, slopes)
+    values, errors = with_group_error(runs, kind, slopes)
     decay = 1 / (2 * max(float(values.mean()), 1e-300))
     return [
-        converged_value(name, "1/ps", float(D), float(error), frames.span, decay, least=BLOCKS)
+        converged_value(name, "1/ps", float(D), float(error), runs.span, decay, least=BLOCKS)
         for name, D, error in zip(names, values, errors, strict=True)
     ]
 
 
 @built_in("spectra and correlations of velocities, angular velocities and angular momenta", position=80)
-def spectrum(frames: RigidFrames) -> AnalysisResult:
+def spectrum(runs: Runs) -> AnalysisResult:
     """Densities of states (cm) of translation and of rotation about each body axis, from the power of velocities and
     angular velocities, and their correlation functions. The integral over wave numbers is the number of degrees of
     freedom of a molecule. Needs frames with velocities, every few fs. Raises OutputError."""
-    if frames.velocities is None or frames.L is None:
+    if any(run.velocities is None or run.L is None for run in runs.members):
         kinds = " or ".join(written(lambda form: form.velocities))
         raise OutputError(f"a spectrum needs velocities in the frames: a trajectory file of type {kinds} has them")
-    interval, lags = interval_and_lags(frames, "a spectrum")
-    size = len(frames) // BLOCKS
+    interval, lags = interval_and_lags(runs, "a spectrum")
+    size = min(runs.frame_count // BLOCKS, runs.shortest)
     found = AnalysisResult("spectrum", "densities of states")
     wavenumbers = np.fft.rfftfreq(size, interval) / PER_CM
     power = Curve("spectrum", ("wave number (1/cm)", wavenumbers), "density of states (cm)", {})
     memory = Curve("velocity_correlation", ("Time (ps)", interval * np.arange(lags)), "correlation", {}, level=0.0)
     found.curves += [power, memory]
-    for kind in frames.moving:
+    for kind in runs.moving:
         if kind.molecule.degrees_of_freedom > 3:
             momenta = lambda part, group: _normalised(_lab_momenta(part, group), lags)  # noqa: E731
-            memory.add(f"correlation L {kind.name}", *with_group_error(frames, kind, momenta))
+            memory.add(f"correlation L {kind.name}", *with_group_error(runs, kind, momenta))
         for title, (weight, of) in _rates(kind).items():
-            seen, errors = with_group_error(frames, kind, lambda part, group, of=of: _normalised(of(part, group), lags))
+            seen, errors = with_group_error(runs, kind, lambda part, group, of=of: _normalised(of(part, group), lags))
             if not seen[1] > CLOSE:
                 raise OutputError(
                     f"frames every {interval:g} ps are not enough for a spectrum: {title} decays between "
@@ -168,7 +180,7 @@ def spectrum(frames: RigidFrames) -> AnalysisResult:
                 )
             memory.add(f"correlation {title}", seen, errors)
 
-            def states(part: RigidFrames, group: Kind, of=of, weight=weight / frames.thermal_energy) -> np.ndarray:
+            def states(part: RigidFrames, group: Kind, of=of, weight=weight / runs.thermal_energy) -> np.ndarray:
                 """2 weight times the power of series (f, n, d) a wave number, sum over d and mean over n; cm."""
                 values, total = of(part, group), 0.0
                 for first in range(0, values.shape[1], 256):
@@ -177,7 +189,7 @@ def spectrum(frames: RigidFrames) -> AnalysisResult:
                     total = total + signal.welch(some, 1 / interval, "hann", size, detrend=no, axis=0)[1].sum(axis=1)
                 return weight * np.asarray(total) * PER_CM / values.shape[1]
 
-            power.add(title, *with_group_error(frames, kind, states))
+            power.add(title, *with_group_error(runs, kind, states))
             top = int(np.argmax(power.columns[title][1:])) + 1
             at, half = float(wavenumbers[top]), float(wavenumbers[1] / 2)
             found.values.append(Value(f"highest peak of {title}", "1/cm", at, half, None, "half the resolution"))
@@ -229,37 +241,27 @@ def total_dipole(frames: RigidFrames) -> np.ndarray:
 
 
 @built_in("dielectric constant from the fluctuation of the total dipole", position=90)
-def dielectric(frames: RigidFrames) -> AnalysisResult:
+def dielectric(runs: Runs) -> AnalysisResult:
     """The static dielectric constant, with the boundary condition of the scene: tin foil or a permittivity around the
-    sphere of Ewald sums or the cavity of a reaction field (Neumann 1983, Mol. Phys. 50, 841). Raises OutputError."""
-    forces = frames.system.scene.forces
-    if not frames.has_box:
-        raise OutputError("a dielectric constant needs a box")
-    if not any(m.charges.any() for m in frames.system.species):
-        raise OutputError("a dielectric constant needs molecules with charges")
-    if frames.system.scene.fields.electric_V_per_nm is not None:
-        raise OutputError("an electric field acts: the fluctuation of the dipole gives no dielectric constant there")
-    if forces.ewald_slab:
-        raise OutputError("a slab has no dielectric constant: leave forces.ewald_slab out, in a box without vacuum")
-    if forces.electrostatics in ("ewald", "pme"):
-        around = forces.ewald_surface_permittivity
-    elif forces.electrostatics == "reaction_field":
-        around = forces.reaction_field_permittivity
-    else:
-        raise OutputError(
-            f"electrostatics = {forces.electrostatics!r} has no known boundary for the fluctuation of the dipole; use "
-            "pme, ewald or reaction_field"
-        )
-    dipole = total_dipole(frames)
-    if not any(kind.molecule.has_dipole for kind in frames.kinds):
+    sphere of Ewald sums or the cavity of a reaction field (Neumann 1983, Mol. Phys. 50, 841).
+
+    The mean dipole is 0 by symmetry, and is not subtracted: its square in a run of length T would take the fraction
+    2 tau/T of the fluctuation. Where something breaks the symmetry, it is subtracted and that fraction is added.
+    Raises OutputError.
+    """
+    around = _permittivity_around(runs)
+    dipoles = [total_dipole(run) for run in runs.members]
+    if not any(kind.molecule.has_dipole for kind in runs.kinds):
         raise OutputError("no molecule has a dipole: its fluctuation gives no dielectric constant")
-    gap = frames.span / (len(frames) - 1)
-    off = dipole - dipole.mean(axis=0)
-    squares = np.einsum("fi,fi->f", off, off)
-    size, error = mean_and_error(squares)
-    correlation = float(np.mean([correlation_time(dipole[:, k], gap) for k in range(3)]))
-    volume = float(frames.volume.mean())
-    y = 4 * np.pi * COULOMB * squares.mean() / (3 * volume * frames.thermal_energy)  # <M²>/(3 eps0 V kT)
+    correlation = float(np.mean([correlation_time_of(runs, [M[:, k] for M in dipoles]) for k in range(3)]))
+    cause = _broken_symmetry(runs)
+    centre, lost = np.zeros(3), 0.0
+    if cause:
+        centre, lost = runs.mean([M.mean(axis=0) for M in dipoles]), min(0.5, 2 * correlation / runs.span)
+    squares = [np.sum((M - centre) ** 2, axis=1) / (1 - lost) for M in dipoles]
+    per_square = 4 * np.pi * COULOMB / (3 * runs.volume * runs.thermal_energy)  # y = <M²>/(3 eps0 V kT)
+    size, error = mean_of_series(runs, squares)
+    y = per_square * size
     found = AnalysisResult("dielectric", "dielectric constant")
     if y >= 2 * around + 1:
         raise OutputError(
@@ -268,22 +270,59 @@ def dielectric(frames: RigidFrames) -> AnalysisResult:
         )
     epsilon, slope = _of_fluctuation(y, around)
     # error of the squares, but not less than of three Gaussian numbers with this correlation time
-    relative_error = max(float(error or 0.0) / float(size or np.inf), np.sqrt(2 * correlation / (3 * frames.span)))
+    relative_error = max(float(error or 0.0) / (size or np.inf), np.sqrt(2 * correlation / (3 * runs.span)))
     spread = relative_error * y * float(slope)
     surroundings = "tin foil" if np.isinf(around) else f"a permittivity of {around:g}"
-    note = f"{surroundings} around, {forces.electrostatics}; correlation time of the dipole {correlation:.3g} ps"
+    electrostatics = runs.system.scene.forces.electrostatics
+    note = f"{surroundings} around, {electrostatics}; correlation time of the dipole {correlation:.3g} ps"
     name, value = "dielectric constant", float(epsilon)
-    found.values.append(converged_value(name, "1", value, spread, frames.span, correlation, note))
-    count = np.arange(1, len(dipole) + 1)
-    sums = np.cumsum(np.einsum("fi,fi->f", dipole, dipole)), np.cumsum(dipole, axis=0)
-    running = sums[0] / count - np.sum((sums[1] / count[:, None]) ** 2, axis=1)
-    so_far = _of_fluctuation(running * y / squares.mean(), around)[0]
-    time = ("Time (ps)", frames.time)
-    found.curves += [
-        Curve("dielectric", time, "dielectric constant so far", {"dielectric constant": so_far}),
-        Curve("dipole", time, "total dipole (D)", {f"M{k} (D)": dipole[:, i] / DEBYE for i, k in enumerate("xyz")}),
-    ]
+    found.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
+    for k, axis in enumerate("xyz"):
+        mean, doubt = mean_of_series(runs, [M[:, k] / DEBYE for M in dipoles])
+        found.values.append(Value(f"mean total dipole along {axis}", "D", mean, doubt, correlation))
+    if cause:
+        found.notes.append(f"{cause}: the mean dipole was subtracted")
+    shown = dipoles[0][: runs.shortest], runs.first.time[: runs.shortest]
+    count = np.arange(1, runs.shortest + 1)
+    running = np.mean([np.cumsum(of_run[: runs.shortest]) / count for of_run in squares], axis=0)
+    time = ("Time (ps)", shown[1])
+    so_far = {"dielectric constant": _of_fluctuation(per_square * running, around)[0]}
+    found.curves.append(Curve("dielectric", time, "dielectric constant so far", so_far))
+    if not runs.are_several:
+        columns = {f"M{axis} (D)": shown[0][:, k] / DEBYE for k, axis in enumerate("xyz")}
+        found.curves.append(Curve("dipole", time, "total dipole (D)", columns))
     return found
+
+
+def _permittivity_around(runs: Runs) -> float:
+    """Permittivity around the sphere of Ewald sums or the cavity of a reaction field; infinity for tin foil. Raises
+    OutputError where the fluctuation of the dipole gives no dielectric constant."""
+    forces = runs.system.scene.forces
+    if not runs.has_box:
+        raise OutputError("a dielectric constant needs a box")
+    if not any(m.charges.any() for m in runs.system.species):
+        raise OutputError("a dielectric constant needs molecules with charges")
+    if runs.system.scene.fields.electric_V_per_nm is not None:
+        raise OutputError("an electric field acts: the fluctuation of the dipole gives no dielectric constant there")
+    if forces.ewald_slab:
+        raise OutputError("a slab has no dielectric constant: leave forces.ewald_slab out, in a box without vacuum")
+    if forces.electrostatics in ("ewald", "pme"):
+        return forces.ewald_surface_permittivity
+    if forces.electrostatics == "reaction_field":
+        return forces.reaction_field_permittivity
+    raise OutputError(
+        f"electrostatics = {forces.electrostatics!r} has no known boundary for the fluctuation of the dipole; use "
+        "pme, ewald or reaction_field"
+    )
+
+
+def _broken_symmetry(runs: Runs) -> str:
+    """What distinguishes a dipole of the system from the opposite one; empty if nothing does."""
+    if any(not kind.moves and kind.molecule.has_dipole for kind in runs.kinds):
+        return "frozen molecules have dipoles"
+    if runs.system.scene.fields.entries:
+        return "a field acts"
+    return "a force of Python acts" if runs.system.scene.from_python else ""
 
 
 def _of_fluctuation(y, around: float):

@@ -6,9 +6,19 @@ import numpy as np
 
 from rigidmd.analysis.pair_histogram import count_pairs, heights
 from rigidmd.analysis.registry import built_in
-from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, with_block_error
+from rigidmd.analysis.result import (
+    BLOCKS,
+    AnalysisResult,
+    Curve,
+    Measured,
+    Value,
+    correlation_time_of,
+    mean_of_series,
+    with_block_error,
+)
 from rigidmd.analysis.rigid_frames import RigidFrames
-from rigidmd.core.statistics import correlation_time, error_of_mean, mean_and_error
+from rigidmd.analysis.runs import Runs
+from rigidmd.core.statistics import error_of_mean, mean_and_error
 from rigidmd.errors import OutputError
 from rigidmd.io.trajectory import near_pairs
 from rigidmd.run.rigid_fit import Kind
@@ -29,22 +39,22 @@ BONDING = ("N", "O", "F")  # donors and acceptors of hydrogen bonds
 
 @built_in("radial distribution functions g(r) of sites of different molecules", position=10)
 def rdf(
-    frames: RigidFrames, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
+    runs: Runs, first: str = "", second: str = "", largest: float | None = None, width: float = WIDTH
 ) -> AnalysisResult:
     """g(r) of two sites, elements or species (centres of mass); default: all pairs of elements, in mixtures of species.
 
     g counts pairs of different molecules against the number that there are, so that it is 1 far away in a small box
     too. largest, width : Å. Each frame has its own cell. Raises OutputError.
     """
-    if not frames.has_box:
+    if not runs.has_box:
         raise OutputError("g(r) needs a box, which defines a density to compare with")
-    half = 0.5 * float(min(heights(cell).min() for cell in frames.cell))
+    half = 0.5 * float(min(heights(cell).min() for run in runs.members for cell in run.cell))
     largest = min(half, LARGEST) if largest is None else largest
     if not 0 < width < largest <= half * (1 + 1e-9):
         asked = f"g(r) up to {largest:g} Å in bins of {width:g} Å"
         raise OutputError(f"{asked} is not possible: half the box is {half:.4g} Å")
-    pairs = [(first, second or first)] if first else _pairs(frames)
-    thinned, notes = _thinned(frames, ENOUGH_MOLECULES)
+    pairs = [(first, second or first)] if first else _pairs(runs)
+    thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
     bins = int(largest / width + 1e-9)
     edges = width * np.arange(bins + 1)
     shells = 4 / 3 * np.pi * np.diff(edges**3)
@@ -52,45 +62,59 @@ def rdf(
     curve = Curve("rdf", ("r (A)", r), "g(r)", {}, level=1.0)
     found = AnalysisResult("rdf", "radial distribution functions", curves=[curve], notes=notes)
     for a, b in pairs:
-        if (pair_count := _pair_count(thinned, a, b)) == 0:
+        if (pair_count := _pair_count(thinned.first, a, b)) == 0:
             found.notes.append(f"g(r) of {a} and {b}: no two different molecules have these sites")
             continue
-        g = np.empty((len(thinned), bins))
-        for k in range(len(thinned)):
-            at, owner = thinned.sites(a, slice(k, k + 1))
-            at_2, owner_2 = (at, owner) if a == b else thinned.sites(b, slice(k, k + 1))
-            counts = count_pairs(at[0], owner, at_2[0], owner_2, thinned.cell[k], width, bins)
-            g[k] = counts * float(thinned.volume[k]) / (pair_count * shells)
+        g = [_g_of_frames(run, a, b, pair_count, width, shells) for run in thinned.members]
         # of the others that each a has, so that two molecules have one neighbour each
-        density = pair_count / len(thinned.sites(a, slice(0, 1))[1]) / float(thinned.volume.mean())
+        density = pair_count / len(thinned.first.sites(a, slice(0, 1))[1]) / thinned.volume
         title = f"g {a}-{b}"
-        parts = _block_means(g)
-        curve.columns[title] = g.mean(axis=0)
-        within = curve.columns[title] * shells * density
+        mean, error = _mean_of_frames(thinned, g)
+        curve.columns[title] = mean
+        within = mean * shells * density
         curve.columns[f"n {a}-{b}"] = np.cumsum(within) - 0.5 * within  # up to the middle of each bin
-        if len(parts) > 1:
-            curve.errors[title] = error_of_mean(parts)
-        found.values += _peaks(f"{a}-{b}", r, g, parts, shells * density, thinned.span / max(1, len(thinned) - 1))
+        if error is not None:
+            curve.errors[title] = error
+        found.values += _peaks(f"{a}-{b}", r, thinned, g, shells * density)
     return found
 
 
-def _thinned(frames: RigidFrames, enough: int) -> tuple[RigidFrames, list[str]]:
+def _g_of_frames(frames: RigidFrames, a: str, b: str, pair_count: int, width: float, shells: np.ndarray) -> np.ndarray:
+    """g of two sites in each frame (f, bins). width, shells : of the bins, Å and Å³"""
+    g = np.empty((len(frames), len(shells)))
+    for k in range(len(frames)):
+        at, owner = frames.sites(a, slice(k, k + 1))
+        at_2, owner_2 = (at, owner) if a == b else frames.sites(b, slice(k, k + 1))
+        counts = count_pairs(at[0], owner, at_2[0], owner_2, frames.cell[k], width, len(shells))
+        g[k] = counts * float(frames.volume[k]) / (pair_count * shells)
+    return g
+
+
+def _thinned(runs: Runs, enough: int) -> tuple[Runs, list[str]]:
     """Evenly spaced frames with about `enough` molecules in total, and a note if these are not all frames."""
-    most = min(MOST, max(FEWEST, enough // len(frames.system.model.species)))
-    found = frames[:: max(1, -(-len(frames) // most))]
-    return found, [f"of {len(found)} of {len(frames)} frames, evenly spaced"] if len(found) < len(frames) else []
+    most = min(MOST, max(FEWEST, enough // len(runs.system.model.species))) * max(1.0, len(runs.members) / BLOCKS)
+    every = max(1, -(-runs.frame_count // int(most)))
+    found = Runs(tuple(run[::every] for run in runs.members))
+    note = f"of {found.frame_count} of {runs.frame_count} frames, evenly spaced"
+    return found, [note] if every > 1 else []
 
 
-def _block_means(values: np.ndarray) -> list[np.ndarray]:
-    parts = np.array_split(values, BLOCKS) if len(values) >= 2 * BLOCKS else []
-    return [part.mean(axis=0) for part in parts]
+def _mean_of_frames(runs: Runs, values: list[np.ndarray]) -> Measured | tuple[np.ndarray, None]:
+    """Mean of arrays (f, p) of the frames of each run, and its error: of one run from blocks, of several from their
+    scatter; None with few frames."""
+    means = [of_run.mean(axis=0) for of_run in values]
+    if runs.are_several:
+        return runs.estimate(means, lambda mean: mean)
+    if len(values[0]) < 2 * BLOCKS:
+        return means[0], None
+    return means[0], error_of_mean([part.mean(axis=0) for part in np.array_split(values[0], BLOCKS)])
 
 
-def _pairs(frames: RigidFrames) -> list[tuple[str, str]]:
+def _pairs(runs: Runs) -> list[tuple[str, str]]:
     """Default pairs of names: elements of a pure liquid, species of a mixture."""
-    names = [kind.name for kind in frames.kinds]
+    names = [kind.name for kind in runs.kinds]
     if len(set(names)) == 1:
-        m = frames.kinds[0].molecule
+        m = runs.kinds[0].molecule
         elements = dict.fromkeys(e for e, mass in zip(m.elements, m.masses, strict=True) if mass > 0 and e != "X")
         names = list(elements) or names
     return list(combinations_with_replacement(dict.fromkeys(names), 2))
@@ -104,12 +128,10 @@ def _pair_count(frames: RigidFrames, a: str, b: str) -> int:
     return len(first) * len(second) - int(same)
 
 
-def _peaks(
-    name: str, r: np.ndarray, frames: np.ndarray, parts: list[np.ndarray], filled: np.ndarray, gap: float
-) -> list[Value]:
+def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], filled: np.ndarray) -> list[Value]:
     """Position and height of the first peak, and neighbours up to the first minimum, if there is a peak.
 
-    frames (f, bins) : g(r) of each, every `gap` ps; parts : means of blocks; filled (bins,) : neighbours where g is 1
+    frames : g(r) of each frame (f, bins) of each run; filled (bins,) : neighbours where g is 1
     """
     width = r[1] - r[0]
     edges = np.append(r - 0.5 * width, r[-1] + 0.5 * width)
@@ -131,29 +153,52 @@ def _peaks(
 
     def seen(g: np.ndarray, top: int) -> np.ndarray:
         low, middle, high = g[top - 1 : top + 2]
-        bend = low - 2 * middle + high
-        shift = 0.5 * (low - high) / bend if bend < 0 else 0.0
+        shift = _shift_of_vertex(low, middle, high)
         position, height = r[top] + shift * width, middle - 0.25 * (low - high) * shift
         return np.array([position, height, within(g, valley(g, top))])
 
-    g = frames.mean(axis=0)
+    def seen_near(g: np.ndarray) -> np.ndarray:
+        return seen(g, around.start + int(g[around].argmax()))
+
+    g = runs.mean([of_run.mean(axis=0) for of_run in frames])
     top = _first_top(g)
     if g.max() < 1.05 or not 0 < top < len(g) - 3:
         return []
     whole = seen(g, top)
     around = slice(max(1, top - max(3, top // 5)), min(len(g) - 3, top + max(3, top // 5) + 1))
-    usable = [seen(part, around.start + int(part[around].argmax())) for part in parts]
+    end = valley(g, top)
+    inside = [within(of_run, end) for of_run in frames]
+    tau = correlation_time_of(runs, inside) if min(map(len, frames)) > 2 else None
     errors: list[float | None] = [None] * 3
-    inside = within(frames, valley(g, top))
-    tau = correlation_time(inside, gap) if len(frames) > 2 else None
-    if len(usable) > 1:
-        position, height, neighbours = error_of_mean(usable)
-        errors = [position, height, max(neighbours, mean_and_error(inside)[1] or 0.0)]
+    if runs.are_several:
+        errors = runs.estimate([of_run.mean(axis=0) for of_run in frames], seen_near)[1].tolist()
+    elif len(frames[0]) >= 2 * BLOCKS:
+        blocks = error_of_mean([seen_near(part.mean(axis=0)) for part in np.array_split(frames[0], BLOCKS)])
+        series = [*_changes_of_vertex(g, frames[0], top, width), inside[0]]  # to first order; blocks are few
+        errors = [max(float(block), mean_and_error(one)[1] or 0.0) for block, one in zip(blocks, series, strict=True)]
     titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
         for (title, unit), value, e in zip(titles, whole, errors, strict=True)
     ]
+
+
+def _shift_of_vertex(low: float, middle: float, high: float) -> float:
+    """Where the parabola through three points at -1, 0, 1 has its highest point; 0 if it has none."""
+    bend = low - 2 * middle + high
+    return float(0.5 * (low - high) / bend) if bend < 0 else 0.0
+
+
+def _changes_of_vertex(g: np.ndarray, frames: np.ndarray, top: int, width: float) -> list[np.ndarray]:
+    """Position and height (f,) of a peak that follow to first order from the differences of frames (f, bins) from their
+    mean g (bins,), up to constants."""
+    low, middle, high = g[top - 1 : top + 2]
+    shift, bend = _shift_of_vertex(low, middle, high), low - 2 * middle + high
+    near = frames[:, top - 1 : top + 2] - g[top - 1 : top + 2]
+    of_bend = np.array([1.0, -2.0, 1.0])
+    of_position = width * (np.array([0.5, 0.0, -0.5]) - shift * of_bend) / bend if bend < 0 else np.zeros(3)
+    of_height = np.array([0.5 * shift * (shift - 1), 1 - shift**2, 0.5 * shift * (shift + 1)])
+    return [near @ of_position, near @ of_height]
 
 
 def _first_top(g: np.ndarray) -> int:
@@ -171,13 +216,13 @@ def _first_top(g: np.ndarray) -> int:
 
 
 @built_in("structure factor S(k) of the centres of mass", position=20)
-def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX) -> AnalysisResult:
+def structure_factor(runs: Runs, name: str = "", largest: float = K_MAX) -> AnalysisResult:
     """S(k) = <|sum exp(i k r)|²>/N of sites, elements or species, from wave vectors of the box; without a name, of the
     centres of all molecules. largest : 1/Å. Raises OutputError."""
-    if not frames.has_box:
+    if not runs.has_box:
         raise OutputError("a structure factor needs a box")
-    thinned, notes = _thinned(frames, ENOUGH_MOLECULES_K)
-    reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T
+    thinned, notes = _thinned(runs, ENOUGH_MOLECULES_K)
+    reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell).T
     shortest = float(heights(reciprocal).min())
     if not largest > shortest:
         why = f"this box has no wave vector shorter than {largest:g} 1/Å"
@@ -185,25 +230,32 @@ def structure_factor(frames: RigidFrames, name: str = "", largest: float = K_MAX
     vectors, bin_of = _k_vectors(reciprocal, largest)
     bins = int(bin_of.max()) + 1
     used, members = np.unique(bin_of, return_inverse=True)
-    values = np.empty((len(thinned), len(used)))
-    for k in range(len(thinned)):
-        at = thinned.positions[k] if not name else thinned.sites(name, slice(k, k + 1))[0][0]
-        phases = (at @ np.linalg.inv(thinned.cell[k])) @ (2 * np.pi * vectors.T)
-        size = np.cos(phases).sum(axis=0) ** 2 + np.sin(phases).sum(axis=0) ** 2
-        values[k] = np.bincount(members, size) / np.bincount(members) / len(at)
+
+    def of_frames(frames: RigidFrames) -> np.ndarray:
+        """S(k) of each frame (f, bins)."""
+        values = np.empty((len(frames), len(used)))
+        for k in range(len(frames)):
+            at = frames.positions[k] if not name else frames.sites(name, slice(k, k + 1))[0][0]
+            phases = (at @ np.linalg.inv(frames.cell[k])) @ (2 * np.pi * vectors.T)
+            size = np.cos(phases).sum(axis=0) ** 2 + np.sin(phases).sum(axis=0) ** 2
+            values[k] = np.bincount(members, size) / np.bincount(members) / len(at)
+        return values
+
+    values = [of_frames(run) for run in thinned.members]
+    mean, error_of_curve = _mean_of_frames(thinned, values)
     length = np.bincount(members, np.linalg.norm(vectors @ reciprocal, axis=1)) / np.bincount(members)
     title = f"S {name or 'centres'}"
-    curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: values.mean(axis=0)}, level=1.0)
-    parts = _block_means(values)
+    curve = Curve("structure_factor", ("k (1/A)", length), "S(k)", {title: mean}, level=1.0)
     vectors_used = f"at most {VECTORS_PER_BIN} k-vectors in each of {bins} bins"
     found = AnalysisResult("structure_factor", "structure factor", curves=[curve], notes=[*notes, vectors_used])
-    if len(parts) > 1:
-        curve.errors[title] = error_of_mean(parts)
-        top = int(np.argmax(curve.columns[title]))
-        height, error = float(curve.columns[title][top]), float(curve.errors[title][top])
+    if error_of_curve is not None:
+        curve.errors[title] = error_of_curve
+        top = int(np.argmax(mean))
+        peak = [of_run[:, top] for of_run in values]
+        error = max(float(error_of_curve[top]), mean_of_series(thinned, peak)[1] or 0.0)
         note = f"at {length[top]:.2f} 1/Å, bins of {K_WIDTH} 1/Å"
-        tau = correlation_time(values[:, top], thinned.span / (len(thinned) - 1))
-        found.values.append(Value("highest peak of S(k)", "1", height, error, tau, note))
+        tau = correlation_time_of(thinned, peak)
+        found.values.append(Value("highest peak of S(k)", "1", float(mean[top]), error, tau, note))
     return found
 
 
@@ -229,16 +281,16 @@ def _k_vectors(reciprocal: np.ndarray, largest: float) -> tuple[np.ndarray, np.n
 
 
 @built_in("profile of the density along an axis of the box", position=30)
-def density_profile(frames: RigidFrames, axis: str = "z", bins: int = 100) -> AnalysisResult:
+def density_profile(runs: Runs, axis: str = "z", bins: int = 100) -> AnalysisResult:
     """Mass density (g/cm³) of each species along an edge of the box: x, y or z for a, b or c. Raises OutputError."""
     if axis not in ("x", "y", "z"):
         raise OutputError(f"unknown axis {axis!r}; name x, y or z (the edges a, b and c of the box)")
-    if not frames.has_box:
+    if not runs.has_box:
         raise OutputError("a profile of the density needs a box")
     if bins < 1:
         raise OutputError(f"a profile needs at least one bin, not {bins}")
     k = "xyz".index(axis)
-    height = float(np.mean([heights(cell)[k] for cell in frames.cell]))
+    height = float(runs.mean([np.mean([heights(cell)[k] for cell in run.cell]) for run in runs.members]))
 
     def profile(part: RigidFrames, kind: Kind) -> np.ndarray:
         across, total = np.linalg.inv(part.cell)[:, :, k], np.zeros(bins)
@@ -252,31 +304,33 @@ def density_profile(frames: RigidFrames, axis: str = "z", bins: int = 100) -> An
 
     at = (np.arange(bins) + 0.5) * height / bins
     curve = Curve("density_profile", (f"{axis} (A)", at), "density (g/cm³)", {})
-    for kind in frames.kinds:
-        values, errors = with_block_error(frames, lambda part, kind=kind: profile(part, kind))
-        title = f"density {kind.name} (g/cm3)"
-        curve.columns[title], curve.errors[title] = curve.columns.get(title, 0.0) + values, errors
+    for name in dict.fromkeys(kind.name for kind in runs.kinds):
+        of_name = [kind for kind in runs.kinds if kind.name == name]  # frozen and mobile ones
+        together = lambda part, of_name=of_name: np.sum([profile(part, kind) for kind in of_name], axis=0)  # noqa: E731
+        curve.add(f"density {name} (g/cm3)", *with_block_error(runs, together))
     return AnalysisResult("density_profile", f"density along {axis}", curves=[curve])
 
 
 @built_in("hydrogen bonds for each molecule, by distances and angles", position=40)
-def hydrogen_bonds(frames: RigidFrames, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE) -> AnalysisResult:
+def hydrogen_bonds(runs: Runs, distance: float = BOND_DISTANCE, angle: float = BOND_ANGLE) -> AnalysisResult:
     """Mean number of hydrogen bonds of a molecule, as donor and acceptor: heavy sites (N, O, F) closer than `distance`
     (Å), with an angle to the bond of the hydrogen below `angle` (degrees). Raises OutputError."""
-    if not any(_donors(kind.molecule) for kind in frames.kinds):
+    if not any(_donors(kind.molecule) for kind in runs.kinds):
         why = "no molecule has a hydrogen bonded to nitrogen, oxygen or fluorine"
         raise OutputError(f"{why}: there are no hydrogen bonds")
-    thinned, notes = _thinned(frames, ENOUGH_MOLECULES)
-    number = len(frames.system.model.species)
-    bonds = np.array([_bonds(thinned, k, distance, angle) for k in range(len(thinned))])  # (f, n)
-    each = bonds.mean(axis=1)
-    value, error = mean_and_error(each)
-    most = int(bonds.max()) + 1
-    fraction = np.array([np.mean(bonds == k) for k in range(most)])
+    thinned, notes = _thinned(runs, ENOUGH_MOLECULES)
+    number = len(runs.system.model.species)
+    bonds = [
+        np.array([_bonds(run, k, distance, angle) for k in range(len(run))]) for run in thinned.members
+    ]  # (f, n) each
+    each = [of_run.mean(axis=1) for of_run in bonds]
+    value, error = mean_of_series(thinned, each)
+    most = int(max(of_run.max() for of_run in bonds)) + 1
+    fractions = [[np.mean(of_run == k) for k in range(most)] for of_run in bonds]
     axis = ("hydrogen bonds", np.arange(most))
-    curve = Curve("hydrogen_bonds", axis, "fraction of molecules", {"share": fraction}, bars=True)
+    curve = Curve("hydrogen_bonds", axis, "fraction of molecules", {"share": thinned.mean(fractions)}, bars=True)
     about = f"{distance:g} Å, {angle:g}°; each bond counts for both of its molecules"
-    tau = correlation_time(each, thinned.span / (len(thinned) - 1))
+    tau = correlation_time_of(thinned, each)
     found = Value("hydrogen bonds of a molecule", "1", value, error, tau, about)
     return AnalysisResult("hydrogen_bonds", f"hydrogen bonds of {number} molecules", [found], [curve], notes)
 

@@ -3,11 +3,13 @@
 from typing import Any
 
 import numpy as np
-from scipy import fft, optimize
+from scipy import fft
 
 from rigidmd.analysis.registry import built_in
+from rigidmd.analysis.relaxation import Relaxations, integral_of, longest_time
 from rigidmd.analysis.result import BLOCKS, AnalysisResult, Curve, Value, converged_value, too_short, with_group_error
 from rigidmd.analysis.rigid_frames import EVEN, RigidFrames
+from rigidmd.analysis.runs import Runs
 from rigidmd.errors import OutputError
 from rigidmd.run.rigid_fit import Kind
 from rigidmd.units import BAR
@@ -48,33 +50,32 @@ YEH_HUMMER = 2.837297
 MPA_S, NM2_PER_S = BAR * 1e4, 0.1
 
 
-def interval_and_lags(frames: RigidFrames, what: str) -> tuple[float, int]:
-    """Interval between frames (ps) and number of lags for a correlation function: half a block. Raises OutputError."""
-    if frames.interval is None:
-        gaps = np.diff(frames.time)
+def interval_and_lags(runs: Runs, what: str) -> tuple[float, int]:
+    """Interval between frames (ps) and number of lags for a correlation function: half a block of all frames, and at
+    most half of a run. Raises OutputError."""
+    if runs.interval is None:
+        gaps = np.concatenate([np.diff(run.time) for run in runs.members])
         raise OutputError(f"{what} needs frames at equal intervals; these are {gaps.min():g} to {gaps.max():g} ps")
-    lags = int(len(frames) // BLOCKS * FIT_TO) + 1
+    lags = int(min(runs.frame_count // BLOCKS, runs.shortest) * FIT_TO) + 1
     if lags < 3:
-        raise OutputError(f"{what} needs at least {4 * BLOCKS} frames; there are {len(frames)}")
-    return frames.interval, lags
+        raise OutputError(f"{what} needs at least {4 * BLOCKS} frames; there are {runs.frame_count}")
+    return runs.interval, lags
 
 
 @built_in("mean squared displacement of the centres of mass", position=50)
-def msd(frames: RigidFrames) -> AnalysisResult:
+def msd(runs: Runs) -> AnalysisResult:
     """Mean squared displacement (Å²) of each species against time, all origins, up to half a fifth of the frames. Paths
     continue through the faces of the box, without the scaling by a barostat. Raises OutputError."""
-    interval, lags = interval_and_lags(frames, "a mean squared displacement")
+    interval, lags = interval_and_lags(runs, "a mean squared displacement")
     curve = Curve("msd", ("Time (ps)", interval * np.arange(lags)), "MSD (Å²)", {}, log=(True, True))
-    for kind in frames.moving:
-        found = with_group_error(
-            frames, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
-        )
+    for kind in runs.moving:
+        found = with_group_error(runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags))
         curve.add(f"MSD {kind.name} (A^2)", *found)
     return AnalysisResult("msd", "mean squared displacement", curves=[curve])
 
 
 @built_in("diffusion coefficient, with the correction for the size of the box", position=60)
-def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> AnalysisResult:
+def diffusion(runs: Runs, viscosity_mPa_s: float | None = None) -> AnalysisResult:
     """D of each species (1e-9 m²/s) from the slope of its mean squared displacement, and D of an infinite box.
 
     viscosity_mPa_s : for the correction of Yeh and Hummer; default: from the pressure tensor of the run, if any
@@ -82,11 +83,11 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
     """
     if viscosity_mPa_s is not None and not 0 < viscosity_mPa_s < np.inf:
         raise OutputError(f"viscosity_mPa_s must be a number above 0, not {viscosity_mPa_s:g}")
-    interval, lags = interval_and_lags(frames, "a diffusion coefficient")
-    first = max(1, int(len(frames) // BLOCKS * FIT_FROM))
+    interval, lags = interval_and_lags(runs, "a diffusion coefficient")
+    first = max(1, int((lags - 1) * FIT_FROM / FIT_TO))
     time = interval * np.arange(first, lags)
     if len(time) < 4:
-        raise OutputError(f"a diffusion coefficient needs at least {8 * BLOCKS} frames; there are {len(frames)}")
+        raise OutputError(f"a diffusion coefficient needs at least {8 * BLOCKS} frames; there are {runs.frame_count}")
 
     half = len(time) // 2
 
@@ -102,35 +103,33 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
     found = AnalysisResult("diffusion", "diffusion coefficients", curves=[curve])
     found.notes.append(f"slope of the mean squared displacement from {time[0]:.3g} to {time[-1]:.3g} ps")
     edge = None  # of a cubic box
-    distance = frames.system.smallest_diameter  # over which a molecule has to move to change its surroundings
-    if frames.has_box:
-        distance = float((frames.volume.mean() / len(frames.system.model.species)) ** (1 / 3))
-        cell = frames.cell.mean(axis=0)
+    distance = runs.system.smallest_diameter  # over which a molecule has to move to change its surroundings
+    if runs.has_box:
+        distance = float((runs.volume / len(runs.system.model.species)) ** (1 / 3))
+        cell = runs.mean_cell
         if np.abs(cell - cell[0, 0] * np.eye(3)).max() < 0.01 * cell[0, 0]:
             edge = float(cell[0, 0])
     eta = Value("viscosity", "mPa s", viscosity_mPa_s, None)
     if viscosity_mPa_s is None:
         try:
-            eta = viscosity(frames).value()
+            eta = viscosity(runs).value()
         except OutputError as error:
             eta = eta._replace(note=str(error))
-    for kind in frames.moving:
-        seen = with_group_error(
-            frames, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags)
-        )
+    for kind in runs.moving:
+        seen = with_group_error(runs, kind, lambda part, group: squared_displacement(part.paths[:, group.index], lags))
         so_far = (values[1:] / (6 * NM2_PER_S * later) for values in seen)
         curve.add(f"MSD/6t {kind.name} (1e-9 m^2/s)", *so_far)
         name = f"D of {kind.name}"
-        (D, bend), (error, doubt) = np.array(with_group_error(frames, kind, slopes)).tolist()
+        (D, bend), (error, doubt) = np.array(with_group_error(runs, kind, slopes)).tolist()
         if D <= 0 or abs(bend) > BEND * D + 2 * np.nan_to_num(doubt):
             why = (
                 f"the slope of its displacement changes from {time[0]:.3g} to {time[-1]:.3g} ps, too short for a "
-                f"value; a run of {4 * frames.span:.3g} ps follows it four times as far"
+                f"value; a run of {4 * runs.span:.3g} ps follows it four times as far"
             )
             found.values.append(too_short(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, why))
             continue
         away = distance**2 / (6 * D)
-        value = converged_value(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, frames.span, away, least=BLOCKS)
+        value = converged_value(name, "1e-9 m²/s", D / NM2_PER_S, error / NM2_PER_S, runs.span, away, least=BLOCKS)
         found.values.append(value)
         if value.value is None or edge is None:
             continue
@@ -139,113 +138,102 @@ def diffusion(frames: RigidFrames, viscosity_mPa_s: float | None = None) -> Anal
             note = f"no correction for the size of the box without a viscosity: {eta.note}"
             found.values.append(Value(name, "1e-9 m²/s", None, None, None, note))
             continue
-        more = YEH_HUMMER * frames.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
-        source = "from this run" if viscosity_mPa_s is None else "as given, without its error"
+        more = YEH_HUMMER * runs.thermal_energy / (6 * np.pi * eta.value * MPA_S * edge) / NM2_PER_S
+        source = "measured here" if viscosity_mPa_s is None else "as given, without its error"
         note = f"corrected by {more:.3g} for L = {edge:.4g} Å with a viscosity of {eta.value:.3g} mPa s, {source}"
         doubt = more * (eta.error or 0.0) / eta.value
         both = None if value.error is None else float(np.hypot(value.error, doubt))
         found.values.append(value._replace(name=name, value=value.value + more, error=both, note=note))
-    if edge is None and frames.has_box:
+    if edge is None and runs.has_box:
         found.notes.append("no correction for the size of the box: the one of Yeh and Hummer is for cubic boxes")
     return found
 
 
-SEGMENTS, SHORTEST = 10, 2.0  # number of segments of the tensor, and the least length of each, ps
-#: Least points of a fit, and least correlation over one interval of the tensor: below it the trapezoidal rule is more
-#: than 4 % too large, if the correlation is an exponential.
-FEWEST, CLOSE = 8, 0.5
-#: The fit ends where the standard error of the mean integral is this fraction of it. With 0.15 the noise of the tail
-#: makes values 5 to 13% too large (400 ps, correlation times of 0.1 to 0.8 ps); with 0.05 fits of 0.4 ns end too early.
-DOUBT = 0.08
-#: Fraction of the integral that the second half of the fit may add, as an exponential does with 2.2 of its times there.
-GROWS = 0.25
-DRAWS = 50  # bootstrap samples of the segments for the error of the fit
+LEAST_TENSOR = 20.0  # least length of the pressure tensor of all runs, ps
+#: Number of segments whose integrals are shown, and least correlation over one interval of the tensor: below it the
+#: trapezoidal rule is more than 4 % too large, if the correlation is an exponential.
+SEGMENTS, CLOSE = 10, 0.5
+#: Largest relative error of a viscosity, and its longest relaxation time as a fraction of the longest of a fit.
+LARGEST_DOUBT, LONGEST_SEEN = 0.5, 0.9
+#: The integral is shown up to this multiple of the longest relaxation time.
+SHOWN_TIMES = 6.0
+COMPONENTS = 5
 
 
 @built_in("viscosity from the pressure tensor, by Green and Kubo", position=100)
-def viscosity(frames: RigidFrames) -> AnalysisResult:
+def viscosity(runs: Runs) -> AnalysisResult:
     """Shear viscosity (mPa s): V/kT times the integral of the correlation of five independent components of the
     pressure tensor (output.pressure_tensor_interval_ps).
 
-    Integrals of ten segments are averaged; A a (1 - exp(-t/a)) + B b (1 - exp(-t/b)) is fitted, each point weighted by
-    its scatter, and its limit is the value (Zhang, Otani & Maginn 2015, J. Chem. Theory Comput. 11, 3537). The error is
-    from a bootstrap of the segments. Raises OutputError.
+    The integral is half the spectral density at frequency 0, from a fit of relaxations to the periodogram
+    (`rigidmd.analysis.relaxation`). It has no time at which it would be cut off. The error is that of the likelihood,
+    and of the choice of the model. Raises OutputError.
     """
-    if not frames.has_box:
+    if not runs.has_box:
         raise OutputError("a viscosity needs a box")
-    if frames.tensor is None or len(frames.tensor) < 2:
-        advice = "output.pressure_tensor_interval_ps = 0.01 suits water"
-        raise OutputError(f"a viscosity needs the pressure tensor: {advice}")
-    gaps = np.diff(frames.tensor[:, 0])
-    interval = float(gaps.mean())
-    if np.ptp(gaps) > EVEN * gaps.max():
-        raise OutputError("a viscosity needs the pressure tensor at equal intervals")
-    if gaps.sum() + interval < SEGMENTS * SHORTEST:
-        least, have = f"{SEGMENTS * SHORTEST:g} ps", f"{gaps.sum():.3g} ps"
-        raise OutputError(f"a viscosity needs at least {least} of the pressure tensor; there are {have}")
-    xx, yy, zz, xy, xz, yz = (frames.tensor[:, k] * BAR for k in range(1, 7))
-    parts = np.stack([xy, xz, yz, (xx - yy) / 2, (yy - zz) / 2], axis=1)
-    size = len(frames.tensor) // SEGMENTS
-    lags = size // 2
-    factor = float(frames.volume.mean()) / frames.thermal_energy / MPA_S
-    segments = parts[: size * SEGMENTS].reshape(SEGMENTS, size, 5)
-    seen = np.array([[correlation(one[:, k], max(2, lags)) for k in range(5)] for one in segments])
-    seen = seen.reshape(-1, max(2, lags))
-    if lags < FEWEST or seen[:, 1].sum() < CLOSE * seen[:, 0].sum():
+    stresses = [_stresses(run) for run in runs.members]
+    interval = _interval_of(runs)
+    length = interval * sum(map(len, stresses))
+    if length < LEAST_TENSOR:
+        have = f"{length - interval * len(stresses):.3g} ps"
+        raise OutputError(f"a viscosity needs at least {LEAST_TENSOR:g} ps of the pressure tensor; there are {have}")
+    factor = runs.volume / runs.thermal_energy / MPA_S
+    start = np.mean([correlation(stress, 2) for stress in stresses], axis=0)
+    limit = integral_of(stresses, interval) if start[1] > CLOSE * start[0] else None
+    if limit is None:
         raise OutputError(
             f"an interval of {interval:.3g} ps of the pressure tensor is too long for a viscosity: stresses decay "
             "in it; output.pressure_tensor_interval_ps = 0.01 suits water"
         )
-    running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))
-    time = interval * np.arange(lags)
-    mean, scatter = running.mean(axis=0), running.std(axis=0, ddof=1)
-    wide = np.flatnonzero(scatter[1:] > DOUBT * np.sqrt(len(running)) * np.abs(mean[1:]))
-    wide = wide[wide > int(np.argmax(mean > 0.5 * mean.max()))]
-    end = max(int(wide[0]) + 1 if len(wide) else lags, FEWEST)
-    whole = _limit(time[:end], mean[:end], scatter[:end])
-    random = np.random.default_rng(0)
-    groups = running.reshape(SEGMENTS, 5, lags)
-    resampled = []
-    for _ in range(DRAWS):
-        chosen = groups[random.integers(0, SEGMENTS, SEGMENTS)].reshape(-1, lags)
-        again = _limit(time[:end], chosen.mean(axis=0)[:end], scatter[:end])
-        resampled += [] if again is None else [again]
-    found = AnalysisResult("viscosity", "viscosity")
-    memory = seen.mean(axis=0) / seen[:, 0].mean()
-    axis, title = ("Time (ps)", time[:end]), "integral (mPa s)"
-    errors = {title: scatter[:end] / np.sqrt(len(running))}
-    found.curves += [
-        Curve("viscosity", axis, "viscosity (mPa s)", {title: mean[:end]}, errors),
-        Curve("stress_correlation", axis, "correlation of stress", {"correlation": memory[:end]}, level=0.0),
-    ]
-    grows = float(mean[end - 1] - mean[end // 2]) > GROWS * float(mean[end - 1])
-    if whole is None or grows or len(resampled) < DRAWS // 2:
+    slowest = float(limit.best.times.max())
+    lags = int(max(8, min(SHOWN_TIMES * slowest / interval, min(map(len, stresses)) // 2)))
+    found = AnalysisResult("viscosity", "viscosity", curves=_curves_of(stresses, interval, lags, factor, limit.best))
+    value, error = factor * limit.value, factor * limit.error
+    longest = longest_time(runs=len(stresses), length=interval * min(map(len, stresses)))
+    if slowest > LONGEST_SEEN * longest or error > LARGEST_DOUBT * value:
         why = (
-            f"the integral of the stress correlation still grows after {time[end - 1]:.3g} ps, too short for a value; "
-            f"a run of {4 * gaps.sum():.3g} ps follows it four times as far"
+            f"the integral of the stress correlation still grows after {longest:.3g} ps, too short for a value; "
+            f"a run of {4 * (length - interval * len(stresses)):.3g} ps follows it four times as far"
         )
-        error = float(scatter[end - 1] / np.sqrt(len(running)))
-        found.values.append(too_short("viscosity", "mPa s", float(mean[end - 1]), error, why))
+        found.values.append(too_short("viscosity", "mPa s", value, error, why))
         return found
-    tau = whole / factor / float(seen[:, 0].mean())  # integral over the value at 0
-    note, error = f"fitted up to {time[end - 1]:.3g} ps", float(np.std(resampled))
-    found.values.append(converged_value("viscosity", "mPa s", whole, error, float(gaps.sum()), tau, note))
+    tau = limit.value / float(start[0])  # integral over the value at 0
+    note = f"relaxation times up to {slowest:.2g} ps, from the spectrum below {limit.highest:.3g}/ps"
+    found.values.append(converged_value("viscosity", "mPa s", value, error, length, tau, note))
     return found
 
 
-def _limit(time: np.ndarray, values: np.ndarray, scatter: np.ndarray) -> float | None:
-    """Limit of a running integral by a fit of two exponentials; None where the fit fails."""
-    top, longest = float(np.max(values)), float(time[-1]) / 2  # longer times would be fits to noise
-    if not top > 0:
-        return None
+def _stresses(frames: RigidFrames) -> np.ndarray:
+    """Five independent components of the stress (l, 5) whose means are 0, u/(Å ps²). Raises OutputError."""
+    if frames.tensor is None or len(frames.tensor) < 2:
+        advice = "set output.pressure_tensor_interval_ps = 0.01, which suits water"
+        raise OutputError(f"a viscosity needs the pressure tensor, which this run did not write: {advice}")
+    xx, yy, zz, xy, xz, yz = (frames.tensor[:, k] * BAR for k in range(1, 7))
+    return np.stack([xy, xz, yz, (xx - yy) / 2, (yy - zz) / 2], axis=1)
 
-    def model(t, first, second, fast, slow):
-        return first * (1 - np.exp(-t / fast)) + second * (1 - np.exp(-t / slow))
 
-    start = (0.4 * top, 0.6 * top, longest / 50, longest / 5)
-    bounds = ([0, 0, time[1] / 10, time[1] / 10], [3 * top, 3 * top, longest, longest])
-    try:
-        best, _ = optimize.curve_fit(model, time[1:], values[1:], start, scatter[1:], bounds=bounds)
-    except (RuntimeError, ValueError):
-        return None
-    return float(best[0] + best[1])
+def _interval_of(runs: Runs) -> float:
+    """Time between lines of the pressure tensor, ps. Raises OutputError if it varies."""
+    gaps = np.concatenate([np.diff(run.tensor[:, 0]) for run in runs.members if run.tensor is not None])
+    if np.ptp(gaps) > EVEN * gaps.max():
+        raise OutputError("a viscosity needs the pressure tensor at equal intervals")
+    return float(gaps.mean())
+
+
+def _curves_of(
+    stresses: list[np.ndarray], interval: float, lags: int, factor: float, model: Relaxations
+) -> list[Curve]:
+    """The running integral with its error from segments of all runs, that of the model, and the correlation."""
+    each = -(-SEGMENTS // len(stresses))  # segments of a run
+    parts = [part for stress in stresses for part in np.array_split(stress, each)]
+    lags = min(lags, min(map(len, parts)) // 2)
+    seen = np.array([correlation(part[:, k], lags) for part in parts for k in range(COMPONENTS)])
+    running = factor * interval * (np.cumsum(seen, axis=1) - 0.5 * (seen + seen[:, :1]))
+    time, title = interval * np.arange(lags), "integral (mPa s)"
+    columns = {title: running.mean(axis=0), "fit (mPa s)": factor * model.integral(time)}
+    errors = {title: running.std(axis=0, ddof=1) / np.sqrt(len(running))}
+    memory = {"correlation": seen.mean(axis=0) / seen[:, 0].mean()}
+    return [
+        Curve("viscosity", ("Time (ps)", time), "viscosity (mPa s)", columns, errors),
+        Curve("stress_correlation", ("Time (ps)", time), "correlation of stress", memory, level=0.0),
+    ]

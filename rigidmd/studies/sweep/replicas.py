@@ -1,21 +1,30 @@
-"""Analyses of all runs of a sweep: of each run, then means over replicas with errors from their scatter."""
+"""Analyses of all runs of a sweep: of each run, and of replicas together with errors from their scatter."""
 
 import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_folder, write_results
-from rigidmd.analysis.result import AnalysisResult, Curve, Value
+from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
+from rigidmd.analysis.registry import selected
+from rigidmd.analysis.result import AnalysisResult
+from rigidmd.analysis.rigid_frames import MOST_NUMBERS, RigidFrames, frames_of_folder
+from rigidmd.analysis.runs import Runs, as_runs
 from rigidmd.core.files import writing
-from rigidmd.core.statistics import standard_error
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, RigidMDError
 from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Column, Table, nine_digits, with_error
-from rigidmd.studies.sweep.folder import describe_values, point_name, read_manifest, short_keys, state_on_disk
-from rigidmd.studies.sweep.table import key_columns
+from rigidmd.run.record import read_record
+from rigidmd.studies.sweep.folder import (
+    SEED,
+    Manifest,
+    describe_values,
+    point_name,
+    read_manifest,
+    short_keys,
+    state_on_disk,
+)
+from rigidmd.studies.sweep.table import SweepRow, key_columns, write_analyses_figure
 
 ANALYSES = "analysis.csv"
 
@@ -44,127 +53,83 @@ def analyse_sweep(
 ) -> list[Combination]:
     """Analyse all finished runs of a sweep. Raises OutputError.
 
-    Means over replicas are written into the folder of the sweep, or into a folder for each combination of the other
-    keys, and all values into analysis.csv. names, start, viscosity, progress, figures : see `analyse_folder`
+    Results of replicas together are written into the folder of the sweep, or into a folder for each combination of
+    the other keys, and all values into analysis.csv. names, start, viscosity, progress, figures : see `analyse_folder`
     """
     manifest = read_manifest(folder)
-    ready = [point for point in manifest.points if state_on_disk(folder, point) == "finished"]
+    ready = {point.folder for point in manifest.points if state_on_disk(folder, point) == "finished"}
     if not ready:
         raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
-    done: dict[str, AnalysisOutput] = {}
-    failed: dict[str, str] = {}
-    for k, point in enumerate(ready):
-        try:
-            done[point.folder] = analyse_folder(
-                folder / point.folder,
-                names,
-                start,
-                viscosity,
-                lambda part, name, k=k, point=point: progress((k + part) / len(ready), f"{point.folder} {name}"),
-                figures,
-            )
-        except OutputError as error:
-            if len(ready) == 1:
-                raise
-            failed[point.folder] = str(error)
-    if not done:
-        raise OutputError(f"{folder}: no point can be analysed: {next(iter(failed.values()))}")
-    found, short = [], short_keys(manifest.keys)
+    selected(names)
+    short, found, seen = short_keys(manifest.keys), [], 0
     for values, points in manifest.combinations():
-        runs = [done[point.folder] for point in points if point.folder in done]
-        missed = {point.folder: failed[point.folder] for point in points if point.folder in failed}
-        if runs:
-            where = folder / point_name(values, short) if values else folder
-            title = describe_values(values, short)
-            found.append(_combine(where, title, values, runs, missed, figures))
-    _write_table(folder, found)
+        finished = [point.folder for point in points if point.folder in ready]
+        if not finished:
+            continue
+        where = folder / point_name(values, short) if values else folder
+        title = describe_values(values, short)
+        request = _Request(names, start, viscosity, figures)
+        show = lambda part, name, seen=seen: progress((seen + part) / len(ready), name)  # noqa: E731
+        found.append(_combine(folder, where, title, values, finished, request, show))
+        seen += len(finished)
+    if not any(combination.results for combination in found):
+        reasons = dict.fromkeys(reason for combination in found for reason in combination.failed.values())
+        raise OutputError(f"{folder}: no point can be analysed: {'; '.join(reasons)}")
+    _write_table(folder, manifest, found)
     return found
 
 
+class _Request(NamedTuple):
+    """See `analyse_folder`."""
+
+    names: list[str]
+    start: float | None
+    viscosity: float | None
+    figures: str
+
+
 def _combine(
+    folder: Path,
     where: Path,
     title: str,
     values: dict[str, Any],
-    runs: list[AnalysisOutput],
-    missed: dict[str, str],
-    figures: str,
+    points: list[str],
+    request: _Request,
+    progress: Callable[[float, str], object],
 ) -> Combination:
-    """Means over the runs of a combination; they are written into a folder if there are several."""
-    results = over_replicas([run.results for run in runs])
-    names = {result.name for result in results}
-    why = {name: reason for run in runs for name, reason in run.failed.items() if name not in names}
-    if len(runs) < 2:
-        return Combination(title, values, 1, results, missed | why, runs[0].files)
+    """Analyses of each run of a combination, written into its folder; and of all of them together, written into the
+    folder `where` if there are several. What fails of one run or of one analysis does not end the others."""
+    members: list[RigidFrames] = []
+    outputs: list[AnalysisOutput] = []
+    failed: dict[str, str] = {}
+    names, start, viscosity, figures = request
+    for k, point in enumerate(points):
+        show = lambda part, name, k=k, point=point: progress((k + part) / (len(points) + 1), f"{point} {name}")  # noqa: E731
+        try:
+            frames = frames_of_folder(read_record(folder / point), start)
+            outputs.append(analyse_frames(folder / point, as_runs(frames), names, viscosity, show, figures))
+        except RigidMDError as error:
+            failed[point] = str(error)
+            continue
+        members.append(_thinned(frames, MOST_NUMBERS // len(points)))
+    if len(members) < 2:
+        (done,) = outputs or [AnalysisOutput({}, [], {}, [])]
+        return Combination(title, values, len(members), done.results, failed | done.failed, done.files)
     with writing(where, "made"):
         where.mkdir(exist_ok=True)
-    frames_used = runs[0].frames_used | {
-        "from_ps": min(run.frames_used["from_ps"] for run in runs),
-        "to_ps": max(run.frames_used["to_ps"] for run in runs),
-        "frames": sum(run.frames_used["frames"] for run in runs),
-        "notes": [f"means over {len(runs)} runs, errors from their scatter"],
-    }
-    files = write_results(where, frames_used, results, why, figures)
-    return Combination(title, values, len(runs), results, missed | why, files)
+    show = lambda part, name: progress((len(points) + part) / (len(points) + 1), f"all runs: {name}")  # noqa: E731
+    done = analyse_frames(where, Runs(tuple(members)), names, viscosity, show, figures)
+    return Combination(title, values, len(members), done.results, failed | done.failed, done.files)
 
 
-def over_replicas(runs: list[list[AnalysisResult]]) -> list[AnalysisResult]:
-    """Means of the results of several runs, with their standard errors; a result of only one run keeps its error."""
-    found: dict[str, list[AnalysisResult]] = {}
-    for results in runs:
-        for result in results:
-            found.setdefault(result.name, []).append(result)
-    return [_mean_of(results, len(runs)) for results in found.values()]
+def _thinned(frames: RigidFrames, most: int) -> RigidFrames:
+    """Evenly spaced frames of at most so many numbers."""
+    every = -(-frames.size // most)
+    return frames if every == 1 else frames[::every].copied()
 
 
-def _mean_of(results: list[AnalysisResult], runs: int) -> AnalysisResult:
-    if len(results) == 1:
-        return results[0]
-    names = dict.fromkeys(value.name for result in results for value in result.values)
-    values = [_mean_value([v for f in results for v in f.values if v.name == name], runs) for name in names]
-    notes, curves = list(dict.fromkeys(note for result in results for note in result.notes)), []
-    by_file: dict[str, list[Curve]] = {}
-    for curve in (curve for result in results for curve in result.curves):
-        by_file.setdefault(curve.file, []).append(curve)
-    for of_file in by_file.values():
-        if (mean := _mean_curve(of_file)) is not None:
-            curves.append(mean)
-        else:
-            notes.append(f"{of_file[0].label}: no mean, because the runs have no common range")
-    return AnalysisResult(results[0].name, results[0].about, values, curves, notes)
-
-
-def _mean_value(values: list[Value], runs: int) -> Value:
-    there = [value.value for value in values if value.value is not None]
-    if len(there) < 2:
-        only = next((value for value in values if value.value is not None), values[0])
-        return only._replace(note=f"of one of {runs} runs") if there else only
-    note = f"over {len(there)} runs" + (f" of {runs}; the others have none" if len(there) < runs else "")
-    mean, error = float(np.mean(there)), float(standard_error(there))
-    return Value(values[0].name, values[0].unit, mean, error, None, note)
-
-
-def _mean_curve(curves: list[Curve]) -> Curve | None:
-    """The mean of curves in their common range, interpolated to the axis of the first. None without such a range."""
-    first = curves[0]
-    if len(curves) == 1:
-        return first
-    header, axis = first.axis
-    if all(len(curve.axis[1]) == len(axis) and np.allclose(curve.axis[1], axis, rtol=1e-9) for curve in curves):
-        kept, sampled = axis, [curve.columns for curve in curves]
-    else:
-        low, high = max(curve.axis[1].min() for curve in curves), min(curve.axis[1].max() for curve in curves)
-        kept = axis[(axis >= low) & (axis <= high)]
-        if len(kept) < 2:
-            return None
-        sampled = [{t: np.interp(kept, c.axis[1], values) for t, values in c.columns.items()} for c in curves]
-    titles = [title for title in first.columns if all(title in one for one in sampled)]
-    columns = {title: np.mean([one[title] for one in sampled], axis=0) for title in titles}
-    errors = {title: standard_error([one[title] for one in sampled]) for title in titles}
-    return Curve(first.file, (header, kept), first.label, columns, errors, first.log, first.level, first.bars)
-
-
-def _write_table(folder: Path, found: list[Combination]) -> None:
-    """analysis.csv: a line for each combination, its values with their errors."""
+def _write_table(folder: Path, manifest: Manifest, found: list[Combination]) -> None:
+    """analysis.csv: a line for each combination, its values with their errors; analysis.png: values against a key."""
     values = {
         combination.title: {(result.name, v.header): v for result in combination.results for v in result.values}
         for combination in found
@@ -179,3 +144,12 @@ def _write_table(folder: Path, found: list[Combination]) -> None:
         columns += with_error(title[1], measured, f"{title[1]} error")
     add_to_folder(folder, [ANALYSES])
     Table(columns, found).write(folder / ANALYSES, csv.QUOTE_NONNUMERIC)
+    rows = [
+        SweepRow(
+            combination.values,
+            {None: {header: (v.value, v.error) for (_, header), v in of.items() if v.value is not None}},
+        )
+        for combination, of in zip(found, values.values(), strict=True)
+    ]
+    if manifest.keys.keys() - {SEED} and len(rows) > 1:
+        write_analyses_figure(folder, manifest, rows)

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidmd.analysis.files import read_table
-from rigidmd.analysis.rigid_frames import production_samples
+from rigidmd.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
+from rigidmd.io.folder import add_to_folder
 from rigidmd.io.write import Column, nine_digits, with_error
 from rigidmd.io.write import Table as ReportTable
 from rigidmd.run.record import Record, read_record
+from rigidmd.scene.stage import Stage
 from rigidmd.studies.sweep.folder import FIGURE, SEED, TABLE, Manifest, describe_values, short_keys, value_name
 
 if TYPE_CHECKING:
@@ -51,8 +53,8 @@ class SweepRow:
         if len(found) < 2:
             return found[0] if found else (nan, None)
         values = np.array([value for value, _ in found])
-        if np.ptp(values) == 0:  # where rounding would give it an error
-            return float(values[0]), 0.0
+        if np.ptp(values) == 0:  # a constant has no error, which rounding would give it
+            return float(values[0]), None
         return float(values.mean()), float(standard_error(values))
 
 
@@ -71,6 +73,8 @@ class Table:
     columns: list[str]
     failed: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Path] = field(default_factory=dict)
+    #: Key -> the keys that vary together with it, itself included.
+    together: dict[str, list[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -140,7 +144,7 @@ def table_of(folder: Path, manifest: Manifest, with_analyses: bool = False) -> T
             runs[point.folder] = folder / point.folder
             columns |= dict.fromkeys(found)
         rows.append(row)
-    return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed, runs)
+    return Table(folder, list(rows[0].values) if rows else [], rows, list(columns), failed, runs, manifest.keys)
 
 
 def summarise_run(record: Record) -> dict[str, Measured]:
@@ -148,6 +152,18 @@ def summarise_run(record: Record) -> dict[str, Measured]:
     if record.is_body:
         return _summarise_motion(record)
     _, production = production_samples(record)
+    found = _means_of(record, production)
+    for stage, samples in earlier_production(record):
+        means = _means_of(record, samples)
+        found |= {f"{stage.label}: {header}": means[header] for header in _of_interest(means, stage)}
+    stages = (record.summary or {}).get("stages") or [{}]
+    if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
+        found[DRIFT] = drift, stages[-1].get("drift_error_kT_ns_per_degree_of_freedom")
+    return found
+
+
+def _means_of(record: Record, production: np.ndarray) -> dict[str, Measured]:
+    """Means of the columns of the log over some samples. A constant has no error."""
     found: dict[str, Measured] = {}
     for name, values in record.columns.items():
         if name in NOT_AVERAGED:
@@ -156,15 +172,19 @@ def summarise_run(record: Record) -> dict[str, Measured]:
         if average is None:
             continue
         if np.ptp(values[production]) == 0:
-            average, error = float(values[production][0]), 0.0
+            average, error = float(values[production][0]), None
         found[IN_LOGS[name].header] = average, error
         if name == "potential":
             n = len(record.system.model.species)
             found[POTENTIAL] = average / n, None if error is None else error / n
-    stages = (record.summary or {}).get("stages") or [{}]
-    if (drift := stages[-1].get("drift_kT_ns_per_degree_of_freedom")) is not None:
-        found[DRIFT] = drift, stages[-1].get("drift_error_kT_ns_per_degree_of_freedom")
     return found
+
+
+def _of_interest(means: dict[str, Measured], stage: Stage) -> list[str]:
+    """Columns of an earlier stage: its main averages, and the box if it changes."""
+    of_box = [IN_LOGS[name].header for name in ("volume", "a", "b", "c", "alpha", "beta", "gamma")]
+    wanted = [*MAIN, *(of_box if stage.changes_box else [])]
+    return [header for header in wanted if header in means and (header != DENSITY or stage.changes_box)]
 
 
 def _summarise_motion(record: Record) -> dict[str, Measured]:
@@ -196,7 +216,8 @@ def table_text(table: Table) -> str:
     def text(value: float, error: float | None) -> str:
         return format_with_error(value, error) if np.isfinite(value) else "-"
 
-    short, shown = short_keys(table.keys), [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns]
+    short = short_keys(table.keys)
+    shown = [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns] + _earlier_densities(table)
     keys = [Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys]
     means = [Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown]
     return ReportTable([*keys, Column("runs", lambda row: str(len(row.runs))), *means], table.rows).text(left=())
@@ -229,6 +250,53 @@ def write_sweep_figure(table: Table, name: str) -> Path | None:
     return table.folder / FIGURE
 
 
+ANALYSES_FIGURE = "analysis.png"
+MOST_VALUES = 12  # panels of the figure of analyses
+
+
+def write_analyses_figure(folder: Path, manifest: Manifest, rows: list[SweepRow]) -> None:
+    """Write analysis.png: what analyses measured against the first numerical key. Nothing is written for values that
+    only one combination has. Raises OutputError.
+
+    rows : of the values of each combination, as results of a single run
+    """
+    count = {
+        column: sum(column in run for row in rows for run in row.runs.values())
+        for row in rows
+        for column in row.runs[None]
+    }
+    shown = [column for column, times in count.items() if times > 1][:MOST_VALUES]
+    keys = [key for key in manifest.keys if key != SEED]
+    table = Table(folder, keys, rows, shown, together=manifest.keys)
+    if shown:
+        add_to_folder(folder, [ANALYSES_FIGURE])
+        title = f"{manifest.name}: measured by analyses, with one standard error"
+        write_figure(folder / ANALYSES_FIGURE, lambda: _figure(table, rows, shown, title))
+
+
+def _earlier_densities(table: Table) -> list[str]:
+    """Columns of densities of stages before the last one."""
+    return [column for column in table.columns if column.endswith(f": {DENSITY}")]
+
+
+#: Last parts of keys -> units on axes.
+UNITS = {
+    "K": "K", "fs": "fs", "ps": "ps", "A": "Å", "bar": "bar", "g_cm3": "g/cm³", "nm": "nm", "s": "s", "kg": "kg",
+    "m": "m", "kJ_mol": "kJ/mol", "V_per_nm": "V/nm", "per_ps": "1/ps", "deg": "°", "u": "u", "rad": "rad",
+}  # fmt: skip
+
+
+def axis_label(key: str, together: Iterable[str]) -> str:
+    """A swept key as the label of an axis: with its unit, and with the keys that vary together with it."""
+    *place, name = key.split(".")
+    ends = [end for end in UNITS if name.endswith(f"_{end}")]
+    end = max(ends, key=len, default="")
+    words = name.removesuffix(f"_{end}").replace("_", " ")
+    label = " ".join([words, *(["of", ".".join(place)] if place else []), *([f"({UNITS[end]})"] if end else [])])
+    others = [other for other in together if other != key]
+    return f"{label}\ntogether with {', '.join(others)}" if others else label
+
+
 def _shown_columns(table: Table) -> list[str]:
     """Columns that are drawn: the density instead of the pressure where a barostat moves the box."""
     there = [column for column in (*MAIN, *MAIN_OF_BODY) if column in table.columns]
@@ -236,6 +304,7 @@ def _shown_columns(table: Table) -> list[str]:
         runs = [run[DENSITY] for row in table.rows for run in row.runs.values()]
         changes = any((error or 0.0) > CHANGES * value for value, error in runs)
         there.remove(PRESSURE if changes and PRESSURE in there else DENSITY)
+    there += _earlier_densities(table)
     if len(there) > MOST_PANELS and DRIFT in there:
         there.remove(DRIFT)
     return there[:MOST_PANELS]
@@ -253,7 +322,7 @@ def _figure(table: Table, rows: list[SweepRow], shown: list[str], title: str):
         curves = _curves(table, rows, key, words, column)
         _draw(axis, curves, None if table.keys else rows[0][column])
         axis.set_title(column, loc="left", fontsize=9, color=INK)
-        axis.set_xlabel(key, fontsize=9, color=INK)
+        axis.set_xlabel(axis_label(key, table.together.get(key, ())), fontsize=9, color=INK)
         if words:
             slanted = max(map(len, words)) > 12
             style = {"rotation": 30, "ha": "right"} if slanted else {"rotation": 0, "ha": "center"}
@@ -284,6 +353,7 @@ def _curves(table: Table, rows: list[SweepRow], key: str, words: list[str], colu
 
 def _draw(axis, curves: dict[str, np.ndarray], band: tuple[float, float | None] | None) -> None:
     """Draw curves side by side. band : mean and error over all runs, drawn behind them"""
+    curves = {label: points[:, np.isfinite(points[1])] for label, points in curves.items()}
     gaps = np.concatenate([np.diff(np.unique(x)) for x, _, _ in curves.values()])
     has_bars = any(np.isfinite(errors).any() for _, _, errors in curves.values())
     spread = has_bars * SPREAD * (gaps.min() if len(gaps) else 1.0) / max(1, len(curves) - 1)
