@@ -6,15 +6,15 @@ FRESH: list[Mutation] = [
     Mutation(
         "F1", "g(r): the mean volume of the run, not that of each frame",
         "analysis/built_in/structure.py",
-        "            g[k] = counts * float(thinned.volume[k]) / (",
-        "            g[k] = counts * float(thinned.volume.mean()) / (",
+        "        g[k] = counts * float(frames.volume[k]) / (",
+        "        g[k] = counts * float(frames.volume.mean()) / (",
         ("test_mixtures.py::test_pairs_of_a_mixture_are_counted_against_the_pairs_that_there_are",),
     ),
     Mutation(
         "F2", "structure factor: the transpose of the reciprocal cell",
         "analysis/built_in/structure.py",
-        "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0)).T\n",
-        "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.cell.mean(axis=0))\n",
+        "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell).T\n",
+        "    reciprocal = 2 * np.pi * np.linalg.inv(thinned.mean_cell)\n",
         ("test_mixtures.py::test_a_structure_factor_is_the_sum_over_its_sites",),
     ),
     Mutation(
@@ -34,8 +34,8 @@ FRESH: list[Mutation] = [
     Mutation(
         "F5", "profile of the density: its axis has the component of the edge for the height of the cell",
         "analysis/built_in/structure.py",
-        "    height = float(np.mean([heights(cell)[k] for cell in frames.cell]))\n",
-        "    height = float(np.mean([cell[k, k] for cell in frames.cell]))\n",
+        "np.mean([heights(cell)[k] for cell in run.cell])",
+        "np.mean([cell[k, k] for cell in run.cell])",
         ("test_mixtures.py::test_the_profile_of_a_mixture_is_that_of_its_rotated_sites",),
     ),
     Mutation(

@@ -502,7 +502,7 @@ def test_adding_an_analysis_takes_one_file(tmp_path, monkeypatch, copy, capsys):
         "def mean_cosine(frames, axis='z', power=1):\n"
         "    'Mean of cos(angle)**power to an axis of the box.'\n"
         "    k = 'xyz'.index(axis)\n"
-        "    found = float((frames.Q[:, :, k, 2] ** power).mean())\n"
+        "    found = float((frames.first.Q[:, :, k, 2] ** power).mean())\n"
         "    return AnalysisResult('mean_cosine', 'cosine', [Value(axis, '1', found, 0.0)])\n"
     )
     monkeypatch.setattr(registry, "KNOWN", registry.KNOWN.copy())

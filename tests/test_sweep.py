@@ -262,7 +262,7 @@ def test_another_scene_is_refused(copied, argon, tmp_path, capsys):
 
 def test_analyse_gives_errors_over_replicas(copied, argon, capsys):
     assert cli.main(["analyse", str(copied), "--only", "rdf,structure_factor"]) == 0
-    assert "over 2 runs" in capsys.readouterr().out
+    assert "temperature_K = 90: 2 runs" in capsys.readouterr().out
     mean = copied / "temperature_K=90"
     own = [np.genfromtxt(copied / f"temperature_K=90_seed={k}" / "rdf.csv", delimiter=",", names=True) for k in (1, 2)]
     both = np.genfromtxt(mean / "rdf.csv", delimiter=",", names=True)

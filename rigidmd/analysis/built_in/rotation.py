@@ -279,7 +279,11 @@ def dielectric(runs: Runs) -> AnalysisResult:
     found.values.append(converged_value(name, "1", value, spread, runs.span, correlation, note))
     for k, axis in enumerate("xyz"):
         mean, doubt = mean_of_series(runs, [M[:, k] / DEBYE for M in dipoles])
-        found.values.append(Value(f"mean total dipole along {axis}", "D", mean, doubt, correlation))
+        name = f"mean total dipole along {axis}"
+        if doubt is None:
+            found.values.append(too_short(name, "D", mean, None, "too short for an error", correlation))
+        else:
+            found.values.append(Value(name, "D", mean, doubt, correlation))
     if cause:
         found.notes.append(f"{cause}: the mean dipole was subtracted")
     shown = dipoles[0][: runs.shortest], runs.first.time[: runs.shortest]

@@ -166,8 +166,8 @@ def viscosity(runs: Runs) -> AnalysisResult:
     pressure tensor (output.pressure_tensor_interval_ps).
 
     The integral is half the spectral density at frequency 0, from a fit of relaxations to the periodogram
-    (`rigidmd.analysis.relaxation`). It has no time at which it would be cut off. The error is that of the likelihood,
-    and of the choice of the model. Raises OutputError.
+    (`rigidmd.analysis.relaxation`). It has no time at which it would be cut off. The error follows from the likelihood
+    and from the choice of the model. Raises OutputError.
     """
     if not runs.has_box:
         raise OutputError("a viscosity needs a box")
@@ -223,7 +223,7 @@ def _interval_of(runs: Runs) -> float:
 def _curves_of(
     stresses: list[np.ndarray], interval: float, lags: int, factor: float, model: Relaxations
 ) -> list[Curve]:
-    """The running integral with its error from segments of all runs, that of the model, and the correlation."""
+    """The running integral with its error from segments of all runs, the integral of a model, and the correlation."""
     each = -(-SEGMENTS // len(stresses))  # segments of a run
     parts = [part for stress in stresses for part in np.array_split(stress, each)]
     lags = min(lags, min(map(len, parts)) // 2)

@@ -123,7 +123,7 @@ def _combine(
 
 
 def _thinned(frames: RigidFrames, most: int) -> RigidFrames:
-    """Evenly spaced frames of at most so many numbers."""
+    """Evenly spaced frames with a largest number of numbers in their arrays."""
     every = -(-frames.size // most)
     return frames if every == 1 else frames[::every].copied()
 
