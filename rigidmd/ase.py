@@ -11,7 +11,7 @@ results = rigidmd.Simulation(scene, forces=[CalculatorForce(calculator)]).run()
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from ase import Atoms
@@ -21,9 +21,9 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 from rigidmd.assemble.assignment import massive_sites
 from rigidmd.assemble.build import build
 from rigidmd.assemble.matching import MatchedMolecules, match, refit
-from rigidmd.assemble.scenes import SOURCE, atoms_errors, scene_from_atoms
+from rigidmd.assemble.scenes import SOURCE, atoms_errors, models_with_absolute_paths, scene_from_atoms
 from rigidmd.assemble.species import species_of
-from rigidmd.assemble.user_code.force import Force, UserForceError
+from rigidmd.assemble.user_code.force import Force, UserForceError, real_numbers
 from rigidmd.core.state import NOW, State, state_of
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.engines.system import System
@@ -38,6 +38,7 @@ from rigidmd.run.minimise import minimise
 from rigidmd.run.record import read_record
 from rigidmd.run.summary import describe_minimum, minimum_figures
 from rigidmd.scene import MolecularScene, Scene
+from rigidmd.scene.base import with_absolute_paths
 from rigidmd.scene.forces import Forces
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
@@ -100,8 +101,8 @@ class RigidMD(Calculator):
                 models, given = _parts_of(models)
         if faults:
             raise SceneError("RigidMD", faults)
-        self._models: Any = models
-        self._settings = given
+        self._models: Any = models_with_absolute_paths(cast(Any, models))
+        self._settings = with_absolute_paths(given)
         self._form: Form = atom_forces
         self._bend, self._tolerance = bend, tolerance
         self._warned = False
@@ -333,17 +334,31 @@ class CalculatorForce(Force):
                 wanted = ["energy", "forces", "stress"] if self._has_virial else ["energy", "forces"]
                 calculator.calculate(self.atoms, wanted, changes)
             found = calculator.results
-            energy, on_sites = found.get("free_energy", found["energy"]) * unit, np.zeros(position.shape)
-            on_sites[atom] = unit * np.asarray(found["forces"])
-            if not self._has_virial:
-                return energy, on_sites
-            stress = np.asarray(found["stress"])
-            stress = stress if stress.shape == (3, 3) else voigt_6_to_full_3x3_stress(stress)
+            energy = (found["free_energy"] if "free_energy" in found else found["energy"]) * unit
+            forces, stress = found["forces"], found["stress"] if self._has_virial else None
         except Exception as error:  # calculators raise anything
             where = f"at step {state.step[NOW]}; {self._closest_atoms()}"
             raise UserForceError(f"the calculator {self.name} raised {describe_error(error)} {where}") from error
+        on_sites = np.zeros(position.shape)
+        on_sites[atom] = unit * self._checked("forces", forces, (len(self.atoms), 3))
+        if stress is None:
+            return energy, on_sites
+        stress = self._checked("stress", stress, (3, 3), (6,))
+        stress = stress if stress.shape == (3, 3) else voigt_6_to_full_3x3_stress(stress)
         arm = position - state.position[sites.molecule]
         return energy, on_sites, -unit * state.volume * stress - on_sites.T @ arm
+
+    def _checked(self, what: str, given: Any, *shapes: tuple[int, ...]) -> np.ndarray:
+        """Values of the calculator as an array of real numbers in one of these shapes. Raises UserForceError."""
+        array, wanted = real_numbers(given), " or ".join(map(str, shapes))
+        if array is None:
+            kind = "masked or complex values" if hasattr(given, "dtype") else f"{given!r:.60}"
+            problem = f"{kind} as {what}, not real numbers of the shape {wanted}"
+        elif array.shape not in shapes:
+            problem = f"{what} of the shape {array.shape}, not {wanted}"
+        else:
+            return array
+        raise UserForceError(f"the calculator {self.name} returned {problem}")
 
     def _closest_atoms(self) -> str:
         """A message with the two atoms of different molecules that are closest."""
@@ -369,12 +384,7 @@ def read_rigidmd(name: str, index: int | slice = -1) -> Atoms | list[Atoms]:
 
 def _parts_of(scene: MolecularScene) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The tables of a scene's species without numbers of molecules, and the other TABLES; paths are absolute."""
-    tables = scene.model_dump(exclude_defaults=True)
-    paths = [*((table, key) for table in tables["molecules"] for key in ("file", "parameters"))]
-    paths += [(force, "module") for force in tables.get("forces", {}).get("custom", ())]
-    for table, key in paths:
-        if key in table:
-            table[key] = str(scene.path(table[key]).resolve())
+    tables = with_absolute_paths(scene.model_dump(exclude_defaults=True), scene.path(""))
     for table in tables["molecules"]:
         table.pop("count", None)
     return list(tables["molecules"]), {key: tables[key] for key in TABLES if key in tables}

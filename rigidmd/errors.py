@@ -5,6 +5,9 @@ exception.
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 #: Characters that a terminal interprets instead of showing: control characters except tab and line ends, and changes of
 #: the direction of writing; and surrogates, which cannot be encoded.
@@ -15,6 +18,44 @@ MOST_SHOWN = 50  # errors in one message
 def visible(text: str) -> str:
     """A text with escapes such as \\x1b for unprintable characters."""
     return UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class Wording:
+    """How messages name what a user may do, for users of Python. The command line has a subclass with its options."""
+
+    #: Keyword of an argument -> what to write for it.
+    arguments = {"force": "force=True", "folder": "folder=...", "file": "another path"}  # noqa: RUF012
+
+    def option(self, name: str) -> str:
+        """An argument by its keyword, such as "force"."""
+        return self.arguments.get(name, name)
+
+    def resume(self, folder: Path) -> str:
+        """What continues the run in a folder."""
+        return "resume=True"
+
+
+_WORDING = [Wording()]  # the last one is in use
+
+
+@contextmanager
+def worded_by(wording: Wording) -> Iterator[None]:
+    """Let messages use another wording."""
+    _WORDING.append(wording)
+    try:
+        yield
+    finally:
+        _WORDING.remove(wording)
+
+
+def option(name: str) -> str:
+    """An argument in a message, as its user writes it: force=True in Python, --force on the command line."""
+    return _WORDING[-1].option(name)
+
+
+def resume_command(folder: Path) -> str:
+    """What continues the run in a folder, for messages."""
+    return _WORDING[-1].resume(folder)
 
 
 class RigidMDWarning(UserWarning):

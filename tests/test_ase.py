@@ -723,3 +723,39 @@ def test_pme_in_a_slanted_cell():
     )
     atoms.calc = RigidMD(list(counts), atom_forces="sites", **keywords)
     assert np.abs(plain.get_forces() - atoms.get_forces()).max() < 1e-3 * np.abs(forces).max()
+
+
+def test_paths_of_a_scene_begin_at_its_folder_however_it_is_used(tmp_path, monkeypatch):
+    """In another folder, a table of the same name has three times the energies."""
+    r = np.arange(2.6, 10.0, 0.02)
+    energy, folders = 4.0 * ((3.4 / r) ** 12 - (3.4 / r) ** 6), (tmp_path / "sub", tmp_path / "other")
+    for folder, factor in zip(folders, (1, 3), strict=True):
+        folder.mkdir()
+        np.savetxt(folder / "t.csv", np.c_[r, factor * energy])
+        (folder / "mine.toml").write_text((ROOT / "rigidmd" / "models" / "argon.toml").read_text())
+    text = (
+        '[box]\nlengths_A = 20.0\n[[molecules]]\nfile = "mine.toml"\ncount = 8\n[forces]\nlennard_jones = false\n'
+        'cutoff_A = 9.0\n[[forces.custom]]\nname = "mine"\ntable = "t.csv"\n[start]\ntemperature_K = 90.0\n'
+        "[[stages]]\nduration_ps = 0.004\n"
+    )
+    (folders[0] / "s.toml").write_text(text)
+    atoms = Atoms("Ar2", positions=[[0, 0, 0], [0, 0, 3.8]], cell=[20] * 3, pbc=True)
+    table = {"custom": [{"name": "mine", "table": "t.csv"}], "lennard_jones": False, "cutoff_A": 9.0}
+    monkeypatch.chdir(folders[0])
+    scenes = [Scene.read("s.toml"), Scene.from_dict(tomllib.loads(text))]
+    calculators = [RigidMD(scenes[0]), RigidMD("argon", **table)]
+    from_atoms = rigidmd.scene_from_atoms(atoms, "mine.toml", forces=table, start={"temperature_K": 90.0})
+    expected = Simulation(scenes[0]).observation.potential
+    monkeypatch.chdir(tmp_path)
+    scenes += [Scene.read("sub/s.toml"), Scene.read("other/../sub/s.toml")]
+    calculators += [RigidMD(scene) for scene in scenes[2:]]
+    monkeypatch.chdir(folders[1])
+    at_3_8 = 4.0 * ((3.4 / 3.8) ** 12 - (3.4 / 3.8) ** 6)
+    at_9 = 4.0 * ((3.4 / 9) ** 12 - (3.4 / 9) ** 6)
+    for calculator in calculators:
+        atoms.calc = calculator
+        found = atoms.get_potential_energy() * EV / KJ_PER_MOL
+        assert found == pytest.approx(at_3_8 - at_9, rel=1e-4)
+    for scene in scenes:
+        assert Simulation(scene).observation.potential == pytest.approx(expected, rel=1e-12)
+    assert Simulation(from_atoms).observation.potential == pytest.approx(at_3_8 - at_9, rel=1e-4)

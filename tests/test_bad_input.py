@@ -21,8 +21,8 @@ from support import (
     step_warnings,
 )
 
-from rigidmd.commands.cli import main
-from rigidmd.errors import MoleculeError, OutputError, SceneError, SimulationError, StructureError
+from rigidmd.commands.cli import CommandLine, main
+from rigidmd.errors import MoleculeError, OutputError, SceneError, SimulationError, StructureError, worded_by
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene, parse_override, schema
 
@@ -120,7 +120,8 @@ def refused(capsys, tmp_path, text, *arguments, code=2):
         ("lengths_A = 20.0", "density_g_cm3 = 1.0\nangles_deg = [80.0, 80.0, 90.0]", ["angles_deg needs lengths_A"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 180.0]", ["angles_deg.2", "less than 180"]),
         ("lengths_A = 20.0", "lengths_A = 20.0\nangles_deg = [90.0, 90.0, 50.0]", ["smallest of a_x, b_y, c_z"]),
-        ("lengths_A = 20.0", "density_g_cm3 = 3000", ["half the shortest edge"]),
+        ("lengths_A = 20.0", "density_g_cm3 = 997", ["box.density_g_cm3 is 997 g/cm³", "is it in kg/m³"]),
+        ("lengths_A = 20.0", "lengths_A = 0.84", ["density of the box is 1009 g/cm³", "an edge in nm?"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\nsites = []\n[[stages]]', ["molecules.1.sites", "needs at least 1"]),
         ("[[stages]]", '[[molecules]]\nname = "x"\ncount = 1\nsites = [{name = "A", mass_u = -1.0, position_A = [0,0,0]}]\n[[stages]]',
          ["molecules.1.sites.0.mass_u", "-1.0", "not be less than 0"]),
@@ -314,9 +315,9 @@ def test_a_molecule_file_with_a_text_without_quotes(tmp_path):
 @pytest.mark.parametrize(
     ("model", "density", "temperature", "fine", "too_long", "words"),
     [
-        ("spce", 1.0, 300, 8, 20, "about its lightest axis by 0.41 rad"),
+        ("spce", 1.0, 300, 5, 20, "about its lightest axis by 0.41 rad"),
         ("nitrogen", 0.8, 77, 40, 120, "about its lightest axis by 0.33 rad"),
-        ("argon", 1.37, 94, 60, 150, "moves by 0.06"),
+        ("argon", 1.37, 94, 40, 150, "moves by 0.06"),
     ],
 )
 def test_check_warns_of_a_step_that_no_liquid_bears(
@@ -344,9 +345,9 @@ def test_a_step_is_long_for_what_moves_and_for_its_scheme():
     assert len(warned()) == 1
     assert not warned(frozen=True)
     assert len(warned(frozen=[1, 2])) == 1
-    assert not warned(stage={"integrator": "srkn_4"})  # stable up to 1.6 times as far
+    assert not warned(stage={"integrator": "srkn_4"})  # stable up to 1.6 times as far, and more accurate
     assert not warned(watch={"stable_step": False})
-    assert not warned(start={"temperature_K": 100.0})
+    assert not warned(start={"temperature_K": 30.0})
     assert len(warned(start={"temperature_K": 100.0}, stage={"temperature_K": 300.0, "ensemble": "nvt"})) == 1
 
 
@@ -571,7 +572,13 @@ def test_output_folders(capsys, tmp_path):
 def test_a_folder_with_a_checkpoint_names_the_command_that_continues_it(names, resumes, tmp_path):
     for name in names:
         (tmp_path / name).touch()
-    with pytest.raises(OutputError, match=r"holds an earlier run; .*--force replaces it, -o names") as refused:
+    with pytest.raises(
+        OutputError, match=r"holds an earlier run; .*force=True replaces it, folder=... names"
+    ) as refused:
+        check_folder(tmp_path, force=False)
+    assert ("resume=True continues it" in str(refused.value)) == resumes
+    assert "--" not in str(refused.value)
+    with worded_by(CommandLine()), pytest.raises(OutputError, match=r"; .*--force replaces it, -o names") as refused:
         check_folder(tmp_path, force=False)
     assert (f"`rigidmd resume {tmp_path}` continues it" in str(refused.value)) == resumes
 

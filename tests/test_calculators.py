@@ -210,3 +210,40 @@ def test_water_by_a_semi_empirical_method():
     data["stages"] = [{"duration_ps": 0.06, "timestep_fs": 2.0}]
     results = rigidmd.Simulation(Scene.from_dict(data), forces=[force]).run()
     assert np.abs(results["drift"]).max() < 0.02 * results["kinetic"].max()
+
+
+class Misshapen(Springs):
+    """Springs whose values are changed from a call on."""
+
+    def __init__(self, change, begins=0):
+        super().__init__()
+        self.change, self.begins = change, begins
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        if self.calls > self.begins:
+            self.results["forces"] = self.change(self.results["forces"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda forces: forces[0], r"forces of the shape \(3,\), not \(12, 3\)"),
+        (lambda forces: forces[:1], r"forces of the shape \(1, 3\), not \(12, 3\)"),
+        (lambda forces: forces[:, :1], r"forces of the shape \(12, 1\), not \(12, 3\)"),
+        (lambda forces: 0.0, r"forces of the shape \(\), not \(12, 3\)"),
+        (lambda forces: forces + 1e-3j, "masked or complex values as forces"),
+        (lambda forces: np.ma.masked_less(forces, 0.0), "masked or complex values as forces"),
+        (lambda forces: forces * np.nan, "which are not finite numbers"),
+        (lambda forces: [["a"] * 3] * 12, "not real numbers"),
+    ],
+)
+def test_forces_of_another_shape_or_kind_are_refused_at_any_step(change, words):
+    with pytest.raises(SceneError, match=words):
+        Simulation(springs(), forces=[CalculatorForce(Misshapen(change))]).step()
+    calculator = Misshapen(change, np.inf)
+    simulation = Simulation(springs(), forces=[CalculatorForce(calculator)])
+    simulation.step(5)
+    calculator.begins = calculator.calls + 2
+    with pytest.raises(SimulationError, match=words):
+        simulation.step(10)

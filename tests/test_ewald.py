@@ -853,7 +853,7 @@ def test_what_energy_says_of_its_figures():
         assert found["components"]["coulomb_self"] * KJ_PER_MOL == pytest.approx(KE * own, rel=1e-9)
         assert "less its value at the cutoff" in said["coulomb_real"]
         assert "without the tail correction" in said["virial"]
-        translation = observe(system, simulation.engine, simulation.state).kinetic_translation / KJ_PER_MOL
+        translation = observe(system, simulation.engine, simulation.state.copy()).kinetic_translation / KJ_PER_MOL
         bar = (2 * translation + found["virial"]) * KJ_PER_MOL / (3 * 13 * 14 * 15) / BAR
         tail = system.tail.pressure(13 * 14 * 15) / BAR
         assert tail < -1

@@ -1,8 +1,10 @@
 """From Python: units of results, data frames, what notebooks and editors show."""
 
 import contextlib
+import copy
 import csv
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 from support import BODIES, BODY, BODY_COLUMNS, COLUMNS, ROOT, TENSOR, Observation, contents, load_model, small_scene
 
 import rigidmd
-from rigidmd.errors import OutputError, SceneError
+from rigidmd.errors import OutputError, SceneError, StructureError
 from rigidmd.run import Every, Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import KJ_PER_MOL
@@ -81,7 +83,7 @@ def test_observers_see_the_units_of_the_log():
         assert reading.sample.momentum == pytest.approx(np.linalg.norm(reading.momentum))
         assert reading.sample.pressure_xy == reading.pressure_tensor_bar[0, 1]
     # forces are the slopes of the energy that is told
-    system, engine, state = simulation.system, simulation.engine, simulation.state
+    system, engine, state = simulation.system, simulation.engine, simulation.state.copy()
     energy = []
     for shift in (1e-4, -1e-4):
         state.position[0, 0] += shift
@@ -472,3 +474,91 @@ def test_a_simulation_takes_what_its_kind_of_scene_has():
     for method in ("start", "settle", "atoms"):
         with pytest.raises(TypeError, match="is a single body; this method is for molecules"):
             getattr(heavy_top(), method)()
+
+
+@pytest.mark.parametrize("make", [argon, heavy_top])
+def test_a_run_again_in_its_folder_continues_after_an_interrupt_and_repeats_after_its_end(make, tmp_path):
+    whole = make(tmp_path / "whole").run()
+    calls = []
+
+    def interrupt(moment):
+        calls.append(moment.step)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    interval = 0.01 if make is argon else 0.02
+    simulation = make(tmp_path / "run", observers=Every(interval, interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        simulation.run()
+    begun = contents(tmp_path / "run")
+    results = simulation.run()
+    for found, expected in zip(results.state, whole.state, strict=True):
+        assert np.array_equal(found, expected)
+    assert begun.keys() <= contents(tmp_path / "run").keys()
+    again = simulation.run()
+    assert np.array_equal(again.state.rotation, whole.state.rotation)
+    assert calls.count(0) >= 2
+    other = make(tmp_path / "run")  # the files are now those of another run
+    with pytest.raises(OutputError, match="resume=True continues it, force=True replaces it") as refused:
+        other.run()
+    assert "--" not in str(refused.value) and " -o" not in str(refused.value)
+
+
+def test_the_state_is_read_only_and_observables_follow_it():
+    simulation, quiet = argon(), argon()
+    for count in (3, 2):
+        simulation.step(count)
+        quiet.step(count)
+        reading, forces = simulation.observation, simulation.forces
+        assert simulation.energy == pytest.approx(reading.potential + reading.kinetic)
+        energies = []
+        for shift in (1e-4, -1e-4):
+            moved, other = simulation.state.copy(), argon()
+            moved.position[1, 2] += shift
+            other.start_from(moved)
+            energies.append(other.observation.potential)
+        assert forces[1, 2] == pytest.approx(-(energies[0] - energies[1]) / 2e-4, rel=1e-5, abs=1e-9)
+    for array in simulation.state:
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+    for found, expected in zip(simulation.run().state, quiet.run().state, strict=True):
+        assert np.array_equal(found, expected)  # observables leave no trace
+
+
+def test_observables_of_a_body():
+    with heavy_top() as simulation:
+        start = simulation.energy
+        simulation.step(20)
+        assert simulation.energy == pytest.approx(start, rel=1e-6)
+        assert simulation.observation.time == simulation.state.time[0] > 0
+        assert simulation.forces.shape == (0, 3)  # it is pinned
+
+
+def test_a_simulation_begins_only_from_states_that_it_can_have():
+    water = small_scene({"spce": 4}, 20.0)
+    simulation = Simulation(water)
+    state = simulation.state.copy()
+    simulation.start_from(state)
+    wrong = {
+        "rotation": [-state.rotation, 2 * state.rotation, state.rotation[:2], state.rotation * np.nan],
+        "position": [state.position[:3], np.vstack([state.position] * 2), state.position + np.inf, None],
+        "velocity": [state.velocity * 1j, state.velocity[:, :2]],
+        "angular_momentum_body": [state.angular_momentum_body[0]],
+        "cell": [-state.cell, state.cell.T + np.triu(np.ones((3, 3)), 1), np.diag([np.inf] * 3), state.cell / 2],
+    }
+    for name, values in wrong.items():
+        for value in values:
+            with pytest.raises(StructureError, match="start_from: ") as refused:
+                simulation.start_from(state._replace(**{name: value}))
+            assert name in str(refused.value) or name == "cell"
+    with pytest.raises(TypeError, match="needs a State"):
+        simulation.start_from(state.position)
+    assert np.array_equal(simulation.state.position, state.position)
+
+
+def test_a_simulation_cannot_be_pickled_or_copied():
+    simulation = argon()
+    for attempt in (pickle.dumps, copy.copy, copy.deepcopy):
+        with pytest.raises(TypeError, match="a Simulation has compiled code"):
+            attempt(simulation)
+    assert np.array_equal(pickle.loads(pickle.dumps(simulation.state)).position, simulation.state.position)

@@ -170,14 +170,14 @@ def test_trajectories_hold_positions_box_time_and_velocities(name, topology, tmp
 def test_wrapped_molecules_are_whole_and_inside(angles, tmp_path):
     box = {"lengths_A": 20.0, "angles_deg": angles}
     simulation = Simulation(small_scene({"spce": 30}, None, box=box, output={"trajectory": "t.trr"}))
-    simulation.state.position[:] += 300.0
-    system = simulation.system
-    x = system.site_positions(simulation.state, wrapped=True).reshape(30, 3, 3)
+    system, state = simulation.system, simulation.state.copy()
+    state.position[:] += 300.0
+    x = system.site_positions(state, wrapped=True).reshape(30, 3, 3)
     centre = np.einsum("s,nsk->nk", system.species[0].masses, x) / system.species[0].mass
     part = centre @ np.linalg.inv(simulation.scene.box.cell)
     assert (part >= -1e-9).all()
     assert (part < 1 + 1e-9).all()
-    moved = (centre - simulation.state.position) @ np.linalg.inv(simulation.scene.box.cell)
+    moved = (centre - state.position) @ np.linalg.inv(simulation.scene.box.cell)
     assert moved == pytest.approx(np.rint(moved), abs=1e-9)
     assert np.linalg.norm(x[:, 1] - x[:, 0], axis=1) == pytest.approx(np.ones(30))
 

@@ -173,7 +173,7 @@ def test_simulations_on_all_threads_at_once_have_the_bits_of_each_alone():
 
 def test_other_threads_of_python_go_on_while_steps_are_taken():
     [simulation] = short_runs(1)
-    engine, state = simulation.engine, simulation.state
+    engine, state = simulation.engine, simulation.state.copy()
     row = SCHEMES["velocity_verlet"]
     engine.advance(state, row, 1e-3, 1)
     for attempt in range(1, 51):  # a busy machine may leave this thread aside during a call, not during all of them

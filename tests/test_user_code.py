@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
+from scenes import GOOD
 from scipy.integrate import quad
 from support import (
     ROOT,
@@ -1056,3 +1057,97 @@ def test_langevin_function_of_dipoles_in_a_field_in_python():
     weight = quad(lambda c: math.exp(mu * c / thermal), -1, 1)[0]
     mean = quad(lambda c: c * math.exp(mu * c / thermal), -1, 1)[0] / weight
     assert energy.mean() / 200 == pytest.approx(-mu * mean, rel=0.01)
+
+
+# --- what is lost at a cutoff, and tables that say too little -----------------------------------------
+
+
+UMBRELLA = {"name": "umbrella", "energy": "0.5*k*(r - r0)**2", "sites": ["AR"]}
+
+
+def of_law(truncation="plain", cutoff=9.0, temperature=298.0, **law):
+    forces = {"cutoff_A": cutoff, "custom": [{"truncation": truncation} | law]}
+    stages = [{"ensemble": "nvt", "temperature_K": temperature, "duration_ps": 0.004}]
+    return small_scene({"argon": 4}, 20.0, forces=forces, stages=stages)
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "umbrella is 121 kJ/mol (49 kT at 298 K) at its cutoff"),
+        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 3.5}, temperature=596.0), "(24 kT at 596 K)"),
+        (of_law("shift", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "its force is -44 kJ/mol/Å"),
+        (of_law("smooth_switch", **UMBRELLA, parameters={"k": 8.0, "r0": 3.5}), "with truncation = smooth_switch"),
+        (of_law(**UMBRELLA, parameters={"k": 8.0, "r0": 9.0}), "where it would change by 1.3e+02 kT"),
+        (of_law(name="charge", energy="q*q*1389/r", sites=["AR"], parameters={"q": 0.4}), "charge is 24.7 kJ/mol"),
+        (of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}), None),
+        (of_law(name="lj", energy="4*e*((s/r)**12 - (s/r)**6)", parameters={"e": 1.0, "s": 3.4}, cutoff=5.0,
+                temperature=87.0), "lj is -0.356 kJ/mol (-0.49 kT at 87 K)"),
+        (of_law(name="wca", energy="e*(s/r)**12", parameters={"e": 1.0, "s": 3.4}), None),
+    ],
+)  # fmt: skip
+def test_what_a_potential_has_at_its_cutoff_is_told(scene, words):
+    warnings = build(scene).warnings
+    assert (warnings == []) == (words is None)
+    assert words is None or words in warnings[0]
+
+
+def lennard_jones_rows(step=0.02, without=(0.0, 0.0), factor=1.0):
+    r = np.arange(2.6, 9.3, step)
+    r = r[(r <= without[0]) | (r >= without[1])]
+    return r, factor * argon_energy(r)[0], factor * argon_energy(r)[1]
+
+
+@pytest.mark.parametrize("gap", [(3.96, 6.96), (4.0, 9.0), (3.6, 4.4), (3.6, 5.2), (3.7, 3.8)])
+@pytest.mark.parametrize("with_forces", [False, True])
+def test_a_gap_in_a_table_is_refused(gap, with_forces):
+    rows = lennard_jones_rows(without=gap)[: 3 if with_forces else 2]
+    with pytest.raises(ValueError, match=r"has a gap from 3\.|has a gap from 4 to 9|forces are not -dE/dr"):
+        rigidmd.pair_law(table=rows).formula(9.0)
+
+
+@pytest.mark.parametrize(
+    ("step", "with_forces"), [(0.02, False), (0.05, True), (0.1, False), (0.1, True), (0.15, True)]
+)
+def test_the_error_of_a_spline_is_what_it_says(step, with_forces):
+    """Compared with the exact energy where it is below ten wells; the estimate is within a factor of 6."""
+    formula = rigidmd.pair_law(table=lennard_jones_rows(step)[: 3 if with_forces else 2]).formula(9.0)
+    radial, r = formula.radial({"scale": 1.0}), np.linspace(2.9, 8.99, 2001)
+    r = r[argon_energy(r)[0] < 10 * ARGON["epsilon"]]
+    off = max(abs(radial(x)[0] / KJ_PER_MOL - argon_energy(x)[0]) for x in r.tolist()) / ARGON["epsilon"]
+    assert off / 3 < formula.error < 6 * off
+
+
+def test_a_table_of_two_parts_or_of_growing_intervals_has_no_gap():
+    fine, coarse = lennard_jones_rows(0.02), lennard_jones_rows(0.1)
+    two = [np.r_[a[fine[0] < 5.0], b[coarse[0] > 5.01]] for a, b in zip(fine, coarse, strict=True)]
+    r = np.geomspace(2.6, 9.3, 200)
+    for rows in (two, (r, *argon_energy(r))):
+        assert rigidmd.pair_law(table=tuple(rows)).formula(9.0).error < 1e-3
+
+
+def test_a_spline_that_is_nonsense_is_refused_and_a_poor_one_told(tmp_path):
+    r, energy, _ = lennard_jones_rows(0.02)
+    wild = energy.copy()
+    wild[120] = 1e6
+    with pytest.raises(ValueError, match=r"the error of its spline is .* of its deepest energy, .* must be below 0.1"):
+        rigidmd.pair_law(table=(r, wild)).formula(9.0)
+    np.savetxt(tmp_path / "argon.csv", np.column_stack(lennard_jones_rows(0.12)[:2]))
+    [told] = build(tabulated(tmp_path, sites=("AR",))).warnings
+    assert re.match(r"argon the error of its spline is \d\.\de-02 of its deepest energy: use smaller", told)
+
+
+@pytest.mark.parametrize("value", ["1e300", "-1e31", "1e308"])
+def test_a_huge_energy_in_a_table_is_told_with_its_line(value, tmp_path):
+    lines = [f"{x:g} {y:g}" for x, y in zip(*lennard_jones_rows(0.1)[:2], strict=True)]
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], f"2.61 {value}", *lines[1:]]))
+    with pytest.raises(ValueError, match=r"t.csv: line 2: 2.61 .* has a number above 1e\+30"):
+        rigidmd.pair_law(table=tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("name", ["energy", "time", "tail", "load", "box", "trajectory"])
+def test_names_that_a_force_cannot_have_are_refused_by_check(name, tmp_path, capsys):
+    entry = f'[[forces.custom]]\nname = "{name}"\nenergy = "1/r**9"\nsites = ["OW"]\n'
+    (tmp_path / "s.toml").write_text(f"{GOOD}\n{entry}")
+    assert main(["check", str(tmp_path / "s.toml")]) == 2
+    assert f"{name} is " in capsys.readouterr().err

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidmd.assemble.defaults import body_with_defaults
 from rigidmd.assemble.memory_check import check_memory_of_samples
+from rigidmd.assemble.plausibility import body_warnings
 from rigidmd.core.integrators import SCHEMES, SOLVERS
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body_step_loop import Body
@@ -70,6 +71,7 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
     system = BodySystem(
         scene=scene, body=body, state=_first_state(scene, body, moments, axes, attitude, spin, rotates), terms=terms,
         mass=mass, axes=axes, inertia=moments, centre=centre, points=points, point_names=names, applied=applied,
+        warnings=body_warnings(scene),
     )  # fmt: skip
     if scene.output.trajectory and system.translates:
         form = not_none(format_of(not_none(scene.output.topology)))

@@ -16,6 +16,7 @@ from rigidmd.assemble.defaults import (
     without_tail_reason,
 )
 from rigidmd.assemble.memory_check import check_memory
+from rigidmd.assemble.plausibility import scene_errors, scene_warnings
 from rigidmd.assemble.species import species_of, split_frozen
 from rigidmd.assemble.stage_description import stage_notes
 from rigidmd.assemble.start import overlaps, residue_numbers, set_momenta, starting_configuration
@@ -49,9 +50,12 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
     species = species_of(scene)
     start = starting_configuration(scene, species)
     space, number = space_of(start.cell), residue_numbers(start)
+    warnings = scene_warnings(scene, species)
     species, index, frozen, faults = split_frozen(scene, species, start.species, number)
     counts = np.bincount(index, minlength=len(species))
     cell = "" if start.cell is None else f"{describe_cell(cell_of(space))}, {describe_basis(start.basis)}"
+    if implausible := scene_errors(scene, species, counts, space):
+        raise SceneError(scene.source, implausible)
     composition = Composition(species, counts, space, start.basis, cell, start.position)
     resolved = with_defaults(scene, composition)
     if faults := [*faults, *resolved.errors]:
@@ -87,7 +91,7 @@ def build(scene: MolecularScene, user_code: bool = True) -> System:
         tail=acting.tail, residue_number=number, from_lattice=scene.structure is None,
         left_out=left_out(scene, acting.terms, model, space, any(m.charges.any() for m in species), without_tail),
         precision_reason=precision_reason, force_error=acting.force_error,
-        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)],
+        notes=[*engine_notes, *acting.notes, *field_notes(scene), *stage_notes(scene.stages)], warnings=warnings,
     )  # fmt: skip
     if user_code:
         if scene.from_python != scene.user_code.names:

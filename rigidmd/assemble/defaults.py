@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.distance import pdist
 
+from rigidmd.assemble.plausibility import shortest_contact
 from rigidmd.core.integrators import RK4, SOLVERS
 from rigidmd.forces.neighbors.space import Triclinic, longest_gaps
 from rigidmd.forces.parts import Composition, Grid, Settings
@@ -149,6 +150,8 @@ def without_tail_reason(scene: MolecularScene, composition: Composition) -> str:
         return "it is for a uniform liquid, and molecules are frozen"
     if composition.space.volume == inf:
         return "the scene has no periodic box"
+    if (forces.cutoff_A or CUTOFF) < shortest_contact(composition.species):
+        return "molecules touch beyond the cutoff"
     if not is_homogeneous(composition):
         return "the molecules do not fill the box evenly"
     return ""

@@ -38,13 +38,17 @@ PRECISIONS = {
 
 def describe(scene: MolecularScene | BodyScene, user_code: bool = True) -> str:
     """How a scene would run. Raises the errors of `build` or `build_body`; user_code: see `build`."""
-    if isinstance(scene, MolecularScene):
-        system = build(scene, user_code)
+    return describe_system(build(scene, user_code) if isinstance(scene, MolecularScene) else build_body(scene))
+
+
+def describe_system(system: System | BodySystem) -> str:
+    """How the scene of a system would run. Raises SceneError if its output cannot be written."""
+    if isinstance(system, System):
         if faults := output_errors(system):
-            raise SceneError(scene.source, faults)
+            raise SceneError(system.scene.source, faults)
         return _describe_molecules(system)
-    text = _describe_body(build_body(scene))
-    if scene.run.is_auto:
+    text = _describe_body(system)
+    if system.scene.run.is_auto:
         text += "\nthe integrator and its step, at most this step, are chosen before the run"
     return text
 

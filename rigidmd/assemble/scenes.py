@@ -18,7 +18,7 @@ from rigidmd.io.formats import STRUCTURE
 from rigidmd.io.formats.cells import cell_error
 from rigidmd.io.formats.through_ase import NAMES, RESIDUE_NAMES, RESIDUE_NUMBERS, atoms_of_system
 from rigidmd.scene import BodyScene, MolecularScene
-from rigidmd.scene.base import AnyScene
+from rigidmd.scene.base import AnyScene, with_absolute_paths
 from rigidmd.scene.molecules import Settings
 from rigidmd.scene.species import SPECIES_FILES
 
@@ -60,7 +60,7 @@ def scene_from_atoms(
     """
     if faults := atoms_errors(atoms):
         raise SceneError(SOURCE, faults)
-    data = plain_values(settings)
+    data = with_absolute_paths(settings)
     filled = {key: data.setdefault(key, {}) for key in ("structure", "start", "box")}
     faults = ["molecules is given by the atoms and models"] if "molecules" in data else []
     for key, table in filled.items():
@@ -78,7 +78,7 @@ def scene_from_atoms(
         box.setdefault("periodic", False)
     if "stages" not in data:
         data["stages"] = [{"duration_ps": DURATION} if structure["velocities"] or draws else {"ensemble": "minimise"}]
-    data["molecules"] = _entries(models)
+    data["molecules"] = models_with_absolute_paths(models)
     data.setdefault("name", atoms.get_chemical_formula()[:40])
     ignored = sorted({type(c).__name__ for c in atoms.constraints if "Bond" not in type(c).__name__} - SHAPES)
     if ignored:
@@ -142,7 +142,7 @@ def _digits(values: np.ndarray) -> list[list[str]]:
     return [[repr(x) for x in row] for row in np.asarray(values, float).tolist()]
 
 
-def _entries(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
+def models_with_absolute_paths(models: str | Sequence[str | Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Tables [[molecules]] of models, with absolute paths, so that they do not depend on the working directory."""
     found = []
     models = plain_values(models)

@@ -29,6 +29,11 @@ SWING_RAD, SWING_DIAMETERS = 0.12, 0.02
 MIXED_ERROR = 3e-6
 #: Least error of Ewald sums that grids in single precision allow, e²/Å².
 MIXED_EWALD_ERROR = 3e-6
+#: Largest error of a step, as a fraction of the forces, without a warning: 6 fs for water with velocity Verlet.
+#: What is advised instead has half of it.
+INACCURATE = 0.1
+#: A step that is this many times shorter than the longest stable one is probably in another unit.
+NEEDLESS = 1000
 #: precision = "auto" is mixed where the error of the time step is at least this many times that of mixed precision.
 MARGIN = 30
 
@@ -104,9 +109,9 @@ def _given_steps(scene: MolecularScene) -> Iterator[tuple[int, Stage, float]]:
 
 
 def step_warnings(scene: MolecularScene) -> list[str]:
-    """Warnings of time steps that are too long for these molecules in a liquid, and of orders that truncated forces do
-    not allow. A step is unstable if a molecule at its thermal speed moves or rotates in it by more than `stable_angle`
-    amplitudes."""
+    """Warnings of time steps that are unstable, inaccurate or needlessly short for these molecules in a liquid, and of
+    orders that truncated forces do not allow. A step is unstable if a molecule at its thermal speed moves or rotates in
+    it by more than `stable_angle` amplitudes."""
     warnings, forces = [], scene.forces
     ends = forces.cutoff_A is not None or scene.box.periodic
     jumps = ends and forces.lennard_jones and forces.truncation in ("plain", "shift")
@@ -118,15 +123,35 @@ def step_warnings(scene: MolecularScene) -> list[str]:
             warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
         if (fastest := fastest_motion(species, temperature)) is None or not scene.watch.stable_step:
             continue
-        time, size, unit, name, does = fastest
-        longest, dt = stable_angle(stage.scheme) * time, stage.timestep_fs * FEMTOSECOND
-        if dt > longest:
-            warnings.append(
-                f"stages.{k}: timestep_fs = {stage.timestep_fs:g} is too long for {name} at {temperature:g} K: in a "
-                f"step it {does} by {dt / time * size:.2g} {unit} (rms); {stage.integrator} is stable up to "
-                f"{longest / FEMTOSECOND:.3g} fs where, as in liquids, the stiffest motions swing by {size:g} {unit}"
-            )
+        if sentence := _step_warning(stage, fastest, temperature):
+            warnings.append(f"stages.{k}: timestep_fs = {stage.timestep_fs:g} {sentence}")
     return warnings
+
+
+def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
+    """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing is."""
+    time, size, unit, name, does = fastest
+    longest, dt = stable_angle(stage.scheme) * time, stage.timestep_fs * FEMTOSECOND
+    limit = f"{longest / FEMTOSECOND:.3g} fs"
+    if dt > longest:
+        return (
+            f"is too long for {name} at {temperature:g} K: in a step it {does} by {dt / time * size:.2g} {unit} (rms); "
+            f"{stage.integrator} is stable up to {limit} where, as in liquids, the stiffest motions swing by {size:g} "
+            f"{unit}"
+        )
+    # hybrid Monte Carlo corrects the error of its steps
+    if (error := step_error(stage.scheme, dt / time)) > INACCURATE and not stage.is_hybrid:
+        better = dt
+        while step_error(stage.scheme, better / time) > INACCURATE / 2:
+            better *= 0.95
+        return (
+            f"is inaccurate for {name} at {temperature:g} K: it {does} as if forces were wrong by {error:.0%}, which "
+            f"shifts temperatures and averages. At {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
+        )
+    if longest < inf and dt * NEEDLESS < longest:
+        cause = "is it in ps?" if dt * 1000 * NEEDLESS >= longest else "is it in another unit?"
+        return f"is {longest / dt:.0f} times shorter than {stage.integrator} needs for {name}, {limit}: {cause}"
+    return ""
 
 
 def precision_for(error: float) -> Literal["double", "mixed"]:

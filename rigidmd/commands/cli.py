@@ -8,9 +8,11 @@ import argparse
 import atexit
 import gc
 import re
+import shlex
 import sys
 import warnings
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 import rigidmd.commands as package
@@ -18,7 +20,7 @@ from rigidmd.commands import BAD_INPUT, FAILED, INTERRUPTED
 from rigidmd.commands.arguments import COMMANDS
 from rigidmd.commands.streams import checked_streams, open_streams, warn
 from rigidmd.core.plain_text import did_you_mean
-from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError
+from rigidmd.errors import RigidMDError, RigidMDWarning, SimulationError, Wording, worded_by
 
 EXAMPLES = """examples:
   rigidmd new water                         copy a scene to start from: water.toml
@@ -29,6 +31,17 @@ EXAMPLES = """examples:
   rigidmd new heavy_top_3 && rigidmd run heavy_top_3.toml      one body: a top, with figures of its motion
   rigidmd help                              the chapters of the documentation
 """
+
+
+class CommandLine(Wording):
+    """How messages name the options of the command line."""
+
+    def option(self, name: str) -> str:
+        return "-o" if name in ("folder", "file") else f"--{name.replace('_', '-')}"
+
+    def resume(self, folder: Path) -> str:
+        return f"`rigidmd resume {shlex.quote(str(folder))}`"
+
 
 #: What the loader of shared libraries and the system report where memory does not suffice.
 OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")
@@ -50,7 +63,8 @@ def main(arguments: list[str] | None = None) -> int:
         open_streams()
         options = _parse(sys.argv[1:] if arguments is None else arguments)
         check_address_space()
-        with warnings.catch_warnings(), without_local_settings(), checked_streams(lasting=options.writes):
+        streams = checked_streams(lasting=options.writes)
+        with warnings.catch_warnings(), without_local_settings(), streams, worded_by(CommandLine()):
             others, warnings.showwarning = warnings.showwarning, show
             return options.command(options)
     except RigidMDError as error:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rigidmd.core.files import atomic_file, writing
 from rigidmd.core.plain_text import did_you_mean, similar_names, suggestion
-from rigidmd.errors import InputError, OutputError
+from rigidmd.errors import InputError, OutputError, option
 
 PACKAGE = Path(__file__).parent.parent
 #: In a wheel the scenes are inside the package; in a checkout or an editable install they are next to it.
@@ -84,14 +84,15 @@ def series_of(name: str) -> list[str]:
 def copy_example(example: Example, path: Path, force: bool, read: Iterable[Path] = ()) -> list[Path]:
     """Copy an example to `path`, with the files that it reads. Returns the paths written. Raises OutputError."""
     if path.suffix != example.path.suffix:
-        raise OutputError(f"{path} must end in {example.path.suffix}: name a file for the {example.kind} with -o")
+        other = f"{option('file')} names another file for the {example.kind}"
+        raise OutputError(f"{path} must end in {example.path.suffix}: {other}")
     inputs = {path.parent / file.relative_to(example.path.parent): file for file in read}
     for target in (path, *inputs):
         kept = target in inputs and target.is_file() and target.read_bytes() == inputs[target].read_bytes()
         if target.is_dir():
-            raise OutputError(f"{target} is a folder; name another file with -o")
+            raise OutputError(f"{target} is a folder; {option('file')} names another file")
         if target.exists() and not force and not kept:
-            raise OutputError(f"{target} exists; --force replaces it, -o names another file")
+            raise OutputError(f"{target} exists; {option('force')} replaces it, {option('file')} names another file")
     for target, source in {path: example.path, **inputs}.items():
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -47,6 +47,14 @@ class State(NamedTuple):
         """A state with copies of all arrays."""
         return State(*(array.copy() for array in self))
 
+    @property
+    def read_only(self) -> "State":
+        """The same arrays, which cannot be written through this state."""
+        views = [array.view() for array in self]
+        for view in views:
+            view.flags.writeable = False
+        return State(*views)
+
     def __repr__(self) -> str:
         """Short: arrays of many bodies would flood a screen."""
         count = max(len(self.rotation), len(self.position))

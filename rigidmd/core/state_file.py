@@ -1,6 +1,7 @@
 """Reading and writing a state, to the bit, as `final.npz`."""
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,17 +80,34 @@ def _damaged(arrays: dict[str, np.ndarray], names: list[str]) -> set[str]:
     shapes |= {"bath": (arrays["bath"].size,)}
     shapes |= {"residue_number": (n,)} if "residue_number" in arrays else {}
     shapes |= {"models": (len(names), 5)} if "models" in arrays else {}
-    bad = {key for key, shape in shapes.items() if arrays[key].shape != shape or arrays[key].dtype.kind not in "fi"}
-    sound = [key for key in shapes if key not in (*bad, "cell")]
-    bad |= {key for key in sound if not (np.abs(arrays[key]) <= LARGEST).all()}  # NaN is not
-    if "cell" not in bad and not is_cell(arrays["cell"]):
-        bad.add("cell")
+    bad = {*array_errors(arrays, shapes)}
     bad |= {key for key in ("species", "residue_number") if key in arrays and arrays[key].dtype.kind != "i"}
     if "species" not in bad and not ((arrays["species"] >= 0) & (arrays["species"] < len(names))).all():
         bad.add("species")
-    if "rotation" not in bad and m and not are_rotations(arrays["rotation"]):
-        bad.add("rotation")
     return bad
+
+
+def array_errors(
+    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], exact: bool = True
+) -> dict[str, str]:
+    """Name -> what is wrong with it, of the arrays of a state that have another shape, or values that no state has.
+
+    exact : whether matrices must be rotations, not only numbers
+    """
+    found = {}
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.shape != shape:
+            found[name] = f"has the shape {array.shape}, not {shape}"
+        elif array.dtype.kind not in "fi":
+            found[name] = f"is of the type {array.dtype}, not of real numbers"
+        elif name == "cell" and not is_cell(array):
+            found[name] = "is not a cell with a along x, b in the xy plane and positive a_x, b_y, c_z"
+        elif name != "cell" and not (np.abs(array) <= LARGEST).all():  # NaN is not
+            found[name] = "is not finite"
+        elif name == "rotation" and exact and not are_rotations(array):
+            found[name] = "has matrices Q that are not rotations, with QᵀQ = 1 and determinant 1"
+    return found
 
 
 def are_rotations(matrices: np.ndarray) -> bool:

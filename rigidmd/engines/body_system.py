@@ -1,7 +1,7 @@
 """The system of a scene of a single body, which an engine moves."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -54,6 +54,7 @@ class BodySystem:
     points: np.ndarray
     point_names: tuple[str, ...]
     applied: dict[str, Callable]
+    warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
     space = Unbounded()
 
     def __repr__(self) -> str:

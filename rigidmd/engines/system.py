@@ -9,10 +9,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from rigidmd.core.state import State
-from rigidmd.core.state_file import SavedState
+from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.engines.samples import OF_TRAJECTORIES
+from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
 from rigidmd.scene import MolecularScene
@@ -53,6 +54,7 @@ class System:
     precision_reason: str = ""  # where the scene has precision = "auto"
     force_error: float | None = None  # estimated rms error of the Coulomb force on a site, u Å/ps²; with Ewald sums
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # of what is allowed and probably not meant
     python_forces: dict[str, Callable] = field(default_factory=dict)  # name of a term that Python computes -> function
     thermostat: Any = None  # user-defined, in place of the thermostat of every stage
     user_terms: dict[str, str] = field(default_factory=dict)  # name of a user-defined term -> description
@@ -158,6 +160,25 @@ class System:
     def precision(self) -> Precision:
         """Precision of forces; a resolved scene has no "auto"."""
         return cast(Precision, self.scene.precision)
+
+    def state_errors(self, state: State) -> list[str]:
+        """Messages on positions, momenta and cell of a state from outside which this system cannot have."""
+        names = State._fields[:5]
+        arrays = {name: np.asarray(getattr(state, name)) for name in names}
+        shapes = {name: getattr(self.state, name).shape for name in names}
+        if found := array_errors(arrays, shapes):
+            about = f"the scene has {len(self.state.position)} molecules"
+            return [f"{name} of the state {problem}; {about}" for name, problem in found.items()]
+        cell = arrays["cell"]
+        if np.isfinite(cell).all() != np.isfinite(self.state.cell).all():
+            return ["one of scene and state has a periodic box, and the other has none"]
+        half = min(space_of(cell).edges) / 2
+        reach = [term.potential.cutoff for term in self.terms.values() if isinstance(term, PairForces)]  # type: ignore[attr-defined]
+        return [
+            f"half the shortest edge of its box, {half:.4g} Å, is below the cutoff of {r:g} Å"
+            for r in reach
+            if r > half
+        ][:1]
 
     def engine(self) -> CpuEngine:
         return self.engine_of(self.terms, self.precision)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.files import atomic_file, sync_file, unreadable_reason
-from rigidmd.errors import CheckpointError
+from rigidmd.errors import CheckpointError, option
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS
 
 #: Version of the format. Version 1 (rigidmd 0.1) named observers by their number; 2 had no record of the run.
@@ -69,7 +69,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if schema != SCHEMA:
         age = "a later" if schema > SCHEMA else "an earlier"
         problem = f"was written by {age} rigidmd (version {schema} of the format; this one reads version {SCHEMA})"
-        raise CheckpointError(f"{path}: {problem}: finish the run with that one, or begin it again with --force")
+        raise CheckpointError(
+            f"{path}: {problem}: finish the run with that one, or begin it again with {option('force')}"
+        )
     return Checkpoint(values, arrays)
 
 
@@ -87,4 +89,4 @@ def latest(folder: Path) -> tuple[Checkpoint, list[str]]:
     if errors:
         raise CheckpointError("; ".join(errors) + f". The run cannot be resumed from {folder}")
     listed = f"it holds {', '.join(there)}" if there else "it is empty"
-    raise CheckpointError(f"{folder} holds no checkpoint ({listed}); --force begins the run again")
+    raise CheckpointError(f"{folder} holds no checkpoint ({listed}); {option('force')} begins the run again")

@@ -1,4 +1,4 @@
-"""The folder of a run. It is never overwritten without --force, and its files are complete or absent."""
+"""The folder of a run. It is never overwritten without `force`, and its files are complete or absent."""
 
 import os
 from collections.abc import Iterable
@@ -8,17 +8,22 @@ from filelock import FileLock, Timeout
 
 from rigidmd.core.files import is_temporary, unreadable_reason, write_text, writing
 from rigidmd.core.toml import shorten_text
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, option, resume_command
 
 #: Names of files of a run. The scene names trajectory and topology.
 SCENE, LOG, MOTION, MOTION_NPZ = "scene.toml", "log.csv", "motion.csv", "motion.npz"
 FINAL, LAST_GOOD, SUMMARY = "final.npz", "last_good_state.npz", "summary.json"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint_previous.npz"
-#: Marks the folder of a run and lists the files that the run may write, one per line. --force may remove them.
+#: Marks the folder of a run and lists the files that the run may write, one per line. `force` may remove them.
 MARKER = ".rigidmd-run"
 LOCK = ".rigidmd-lock"
 #: The manifest of a sweep, in the parent folder of its runs.
 SWEEP = "sweep.json"
+
+
+def elsewhere() -> str:
+    """The advice to take another folder, for messages."""
+    return f"{option('folder')} names another folder"
 
 
 def check_folder(
@@ -32,22 +37,23 @@ def check_folder(
     except OSError as error:  # a name that is too long
         raise OutputError(f"{shorten_text(str(folder))} cannot be written: {error.strerror}") from None
     if exists and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name another folder with -o")
+        raise OutputError(f"{folder} is a file; {elsewhere()}")
     if not is_empty(folder):
         if not (folder / marker).is_file():
-            raise OutputError(f"{folder} is not empty and holds no earlier {what}; name another folder with -o")
+            raise OutputError(f"{folder} is not empty and holds no earlier {what}; {elsewhere()}")
         if not force:
-            resume = f"`rigidmd resume {folder}` continues it, " if (folder / CHECKPOINT).is_file() else ""
-            raise OutputError(f"{folder} holds an earlier {what}; {resume}--force replaces it, -o names another folder")
+            resume = f"{resume_command(folder)} continues it, " if (folder / CHECKPOINT).is_file() else ""
+            advice = f"{resume}{option('force')} replaces it, {elsewhere()}"
+            raise OutputError(f"{folder} holds an earlier {what}; {advice}")
         replaced = {(folder / name).resolve() for name in written_by_runs(folder, marker)}
         if used := [path for path in inputs if path.resolve() in replaced]:
-            raise OutputError(f"{used[0]} is an input of this run and would be replaced; name another folder with -o")
+            raise OutputError(f"{used[0]} is an input of this run and would be replaced; {elsewhere()}")
         check_names(folder, names, marker)
     parent = folder
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder} cannot be written: no permission in {parent}; name another folder with -o")
+        raise OutputError(f"{folder} cannot be written: no permission in {parent}; {elsewhere()}")
 
 
 def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
@@ -55,7 +61,7 @@ def check_names(folder: Path, names: Iterable[str], marker: str = MARKER) -> Non
     known = {*written_by_runs(folder, marker), marker, LOCK}
     if foreign := [name for name in names if name not in known and os.path.lexists(folder / name)]:
         problem = f"{folder / foreign[0]} exists, was not written by rigidmd, and would be replaced"
-        raise OutputError(f"{problem}; move it away, or name another folder with -o")
+        raise OutputError(f"{problem}; move it away, or {elsewhere()}")
 
 
 def write_marker(folder: Path, names: Iterable[str], marker: str = MARKER) -> None:
@@ -127,7 +133,7 @@ class FolderLock:
         try:
             self._lock.acquire()
         except Timeout:
-            raise OutputError(f"another run is writing in {self._folder}; name another folder with -o") from None
+            raise OutputError(f"another run is writing in {self._folder}; {elsewhere()}") from None
         except OSError as error:
             raise OutputError(f"{self._folder} cannot be written: {error.strerror}") from None
 
@@ -151,6 +157,31 @@ def never_began(folder: Path) -> bool:
     with writing(log, "read"):
         is_short = not unreadable_reason(log, 1e5) and len(log.read_bytes().splitlines()) <= 2  # its header, its start
     return is_short or not log.exists()
+
+
+class RunMark:
+    """Recognises the last run in a folder, by its scene file, which no other run leaves unchanged."""
+
+    def __init__(self, folder: Path, is_complete: bool):
+        self._folder, self.is_complete = folder, is_complete
+        self._written = self._last_written()
+
+    def _last_written(self) -> tuple[int, int] | None:
+        try:
+            found = (self._folder / SCENE).stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the files in the folder are still those of this run."""
+        return self._written is not None and self._written == self._last_written()
+
+    @property
+    def can_continue(self) -> bool:
+        """Whether something of the run remains to be done, and it has a checkpoint."""
+        return not self.is_complete and any((self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS))
 
 
 def offsets_of(trajectory: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidmd.core.files import atomic_file, write_text
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, option
 
 
 def check_target(
@@ -25,9 +25,9 @@ def check_target(
     if not path.parent.is_dir():
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
-        raise OutputError(f"{path} is an input of this {what}; -o names another file")
+        raise OutputError(f"{path} is an input of this {what}; {option('file')} names another file")
     if path.exists() and not force:
-        raise OutputError(f"{path} exists; --force replaces it, -o names another file")
+        raise OutputError(f"{path} exists; {option('force')} replaces it, {option('file')} names another file")
 
 
 def write_json(path: Path, data: Any, **options: Any) -> None:

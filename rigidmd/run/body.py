@@ -28,7 +28,7 @@ from rigidmd.mechanics.rotation import orthogonality_error
 from rigidmd.run.checks import MIN_INERTIA_FRACTION, ROUNDING, FailedCheck
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
-from rigidmd.run.pilot.stable_step import fastest_body_rate
+from rigidmd.run.pilot.stable_step import body_step_warnings, fastest_body_rate
 from rigidmd.run.report import body_summary_text
 from rigidmd.run.resume import Arrays, NotNegative, RunRecord, check_same_scene, state_from
 from rigidmd.run.schedule import Segment, interruptible
@@ -70,13 +70,19 @@ class Sampler(Observer):
     def resume(self, run: "Simulation", kept: Checkpoint) -> None:
         super().resume(run, kept)
         times = np.array([seen.time for seen in self.snapshots])
-        if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.state.time[NOW]).all()):
+        if not ((np.diff(times) >= 0).all() and (times >= 0).all() and (times <= run.part.state.time[NOW]).all()):
             raise ValueError("the times of its samples cannot be of a run")
         for seen in self.snapshots:
-            state_from(dict(zip(STORED_NAMES, seen.state, strict=True)), run.state, exact=False)
+            state_from(dict(zip(STORED_NAMES, seen.state, strict=True)), run.part.state, exact=False)
 
     def see(self, moment: Moment) -> None:
         self.snapshots.append(Snapshot(moment.time, moment.state))
+
+
+def energies_of(system: BodySystem, state: State) -> dict[str, float]:
+    """The columns of `energies` at one state, J."""
+    columns = energies(system, state.time[:1], State(*(array[None] for array in state)))
+    return {name: float(values[0]) for name, values in columns.items()}
 
 
 class BodyWatch(Observer):
@@ -93,7 +99,7 @@ class BodyWatch(Observer):
         system, every = run.system, max(1, round(not_none(run.scene.output.interval_s) / run.scene.run.timestep_s))
         most = EVALUATIONS_PER_CHECK // getattr(system.method, "force_evaluations", 1)  # half a second of computing
         self.steps = min(most, SAMPLES_PER_CHECK * every)
-        self._start = self._energies(system.state)
+        self._start = energies_of(system, system.state)
         weights = [term for term in system.terms.values() if isinstance(term, SteadyForce)]
         swing = sum(np.linalg.norm(term.force) * np.linalg.norm(term.point) for term in weights)
         self.exchanged = abs(self._start["kinetic"]) + (0.0 if system.translates else 2 * float(swing))
@@ -103,16 +109,12 @@ class BodyWatch(Observer):
         super().resume(run, kept)
         if self.exchanged < least:
             raise ValueError(f"it has exchanged an energy of {self.exchanged:g} J")
-        if problem := self._failed_check(run.state, run.scene.run.timestep_s):
+        if problem := self._failed_check(run.part.state, run.scene.run.timestep_s):
             raise ValueError(f"its state cannot be of this run: {problem}")
 
     def see(self, moment: Moment) -> None:
-        if problem := self._failed_check(self._run.state, self._run.segment.dt):
+        if problem := self._failed_check(self._run.part.state, self._run.segment.dt):
             raise problem
-
-    def _energies(self, state: State) -> dict[str, float]:
-        columns = energies(self._system, state.time[:1], State(*(array[None] for array in state)))
-        return {name: float(values[0]) for name, values in columns.items()}
 
     @np.errstate(over="ignore", invalid="ignore")
     def _failed_check(self, state: State, dt: float) -> FailedCheck | None:
@@ -129,7 +131,7 @@ class BodyWatch(Observer):
                 return FailedCheck(message, factor=angle / limits.turn_rad)
         if not limits.energy or not is_balanced(system):
             return None
-        start, now = self._start, self._energies(state)
+        start, now = self._start, energies_of(system, state)
         self.exchanged = max(self.exchanged, sum(abs(now[key] - start[key]) for key in ("potential", "work")))
         error = abs(now["energy"] - now["work"] - start["energy"] + start["work"])
         scale = self.exchanged + ROUNDING * abs(now["energy"])
@@ -250,10 +252,7 @@ class BodyRun(RunPart):
             return
         stable = self.record.stable = angle / rate
         if run.timestep_s > stable:
-            self.simulation.note(
-                f"timestep_s = {run.timestep_s:g} is longer than what is stable: at its start the body swings or spins "
-                f"at {rate:.3g} rad/s, which {run.integrator} can follow up to {stable:.3g} s"
-            )
+            self.simulation.note(*body_step_warnings(system))
 
     def durations(self) -> list[float]:
         return [segment.steps * segment.dt for segment in self._segments]
@@ -293,6 +292,16 @@ class BodyRun(RunPart):
 
     def observe(self, moment: Moment) -> Pose:
         return self.system.pose(moment.time, moment._state)
+
+    def observe_now(self) -> Pose:
+        return self.system.pose(float(self.state.time[NOW]), self.state)
+
+    def energy_now(self) -> float:
+        return energies_of(self.system, self.state)["energy"]
+
+    def forces_now(self) -> np.ndarray:
+        with interruptible():
+            return self.engine.evaluate(self.state)[0].force
 
     def default_observers(self) -> list[Observer]:
         output, interval = self.scene.output, not_none(self.scene.output.interval_s)

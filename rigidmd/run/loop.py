@@ -20,7 +20,7 @@ from rigidmd.core.files import LostFileError, writing
 from rigidmd.core.process import PROCESS_LOCK
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES
 from rigidmd.engines.protocol import Halted, NotFiniteError
-from rigidmd.errors import OutputError, RigidMDError, SimulationError
+from rigidmd.errors import OutputError, RigidMDError, SimulationError, resume_command
 from rigidmd.io import folder as run_folder
 from rigidmd.io.checkpoint import Checkpoint, latest
 from rigidmd.io.folder import CHECKPOINT, PREVIOUS, SUMMARY, FolderLock
@@ -68,6 +68,7 @@ class RunLoop:
         self.interrupted, self.out_of_time, self.advanced = False, False, 0
         self.signal: int | None = None
         self.results: Results | None = None
+        self.has_begun = False  # whether the files of the folder are those of this run
         self._error: Exception | None = None  # of an observer
         self._failed_before: list[Observer] = []
         self._bar, self._progress = progress_of(0.0, "", False), False
@@ -142,10 +143,12 @@ class RunLoop:
             if self._folder is not None and stays:
                 run_folder.check_names(self._folder, names)
             elif self._folder is not None:
-                source = Path(simulation.scene.source)
+                source = simulation.scene.path(Path(simulation.scene.source).name)
                 inputs = [*simulation.scene.inputs.values(), *([source] if source.is_file() else [])]
                 run_folder.check_folder(self._folder, self._force, inputs, names)
             if kept is None:
+                for warning in part.system.warnings:
+                    simulation.note(warning)
                 # of several runs one compiles, and the others read its cache
                 with interruptible(), PROCESS_LOCK, compiling_announced(self._announce_compiling):
                     part.prepare()
@@ -168,6 +171,7 @@ class RunLoop:
                     (self._folder / SUMMARY).unlink(missing_ok=True)
             elif self._folder is not None:
                 run_folder.make_folder(self._folder, names, lock)
+            self.has_begun = True
             yield
             for observer in observers:
                 if kept is None:
@@ -251,7 +255,8 @@ class RunLoop:
                     return OutputError(f"{where}{error}; the run cannot continue it{self._last_words()}")
             advice = ""
             if self._folder is not None and any((self._folder / name).is_file() for name in (CHECKPOINT, PREVIOUS)):
-                advice = f". Free disk space and resume from the last checkpoint: rigidmd resume {self._folder}"
+                resume = resume_command(self._folder)
+                advice = f". Free disk space, then {resume} continues from the last checkpoint"
             return OutputError(f"{where}{error}{advice}")
         return SimulationError(f"{where}{part.explain(error)}{self._last_words()}")
 

@@ -20,9 +20,9 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import IN_LOGS, OF_TRAJECTORIES, Samples, equilibrated
+from rigidmd.engines.samples import OF_TRAJECTORIES, Samples, equilibrated
 from rigidmd.engines.system import System
-from rigidmd.errors import EngineError, SceneError, SimulationError
+from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.io.formats.through_ase import atoms_of_system
@@ -101,9 +101,6 @@ class MolecularRun(RunPart):
         super().__init__(simulation)
         given = forces if isinstance(forces, Sequence) and not hasattr(forces, "_fields") else (forces,)
         self._start = build(scene.with_user_code(() if forces is None else given, thermostat))
-        if clash := [name for name in self._start.user_terms if name in IN_LOGS]:
-            errors = [f"{name} is a column of the log; name the force otherwise" for name in clash]
-            raise SceneError(scene.source, errors)
         self.reset()
 
     @property
@@ -111,6 +108,10 @@ class MolecularRun(RunPart):
         return usable_threads(self.scene.threads)
 
     def start_from(self, state: State) -> None:
+        if not isinstance(state, State):
+            raise TypeError(f"start_from needs a State, such as results.state, not {type(state).__name__}")
+        if faults := self._start.state_errors(state):
+            raise StructureError("start_from", faults)
         self._start = replace(self._start, state=state_of(*state[:5]), from_lattice=False)
         self.reset()
 
@@ -140,6 +141,7 @@ class MolecularRun(RunPart):
 
     def reset(self) -> None:
         super().reset()
+        self._is_sampled = False  # whether `_sampler` belongs to the present state
         self._set_stages(self._start.scene.stages)  # an earlier run may have chosen an integrator
         self.engine = self.system.engine()
         self.state = self.system.state.copy()
@@ -392,10 +394,24 @@ class MolecularRun(RunPart):
             verlet_step=stage.timestep_fs * FEMTOSECOND if is_verlet else nan,
         )  # fmt: skip
 
+    def observe_now(self) -> Observation:
+        with interruptible(), user_errors_explained(self.system):
+            if not self._is_sampled:
+                return observe(self.system, self.engine, self.state)
+            now, position = self.state, self.record.position
+            moment = Moment(self.simulation, int(now.step[NOW]), float(now.time[NOW]), position.segment)
+            return self.observe(moment)
+
+    def energy_now(self) -> float:
+        return self.observe_now().energy
+
+    def forces_now(self) -> np.ndarray:
+        return self.observe_now().force
+
     def default_observers(self) -> list[Observer]:
         output, interval = self.scene.output, self.scene.output.log_interval_ps
         check = checks.StepCheck(self.system, self.scene.watch)
-        self._sampler = Sampler(self.simulation, interval, check)
+        self._sampler, self._is_sampled = Sampler(self.simulation, interval, check), True
         # external engines check their steps themselves
         watch = [] if self.scene.engine.is_external else [StepWatch(self.simulation, check)]
         files: list[Observer] = []
@@ -467,7 +483,7 @@ class MolecularRun(RunPart):
         forces = np.linalg.norm(seen.load.force, axis=1)
         found = {
             "unit": unit, "molecules": len(self.system.model.species), "relief_steps": removal.steps if removal else 0,
-            "notes": list(self.system.notes),
+            "notes": [*self.system.notes, *self.system.warnings],
             "components": {name: energy / size for name, energy in seen.components.items()},
             "potential": seen.potential / size, "kinetic": seen.kinetic / size,
             "virial": float(seen.virial.trace()) / size, "virial_tensor": (seen.virial / size).tolist(),

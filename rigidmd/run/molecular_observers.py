@@ -72,7 +72,7 @@ def _check_next_step(run: "Simulation", check: checks.StepCheck, load: Load, sta
     """Raise the failed check of the next step of a stage, if the stage has steps."""
     if not stage.is_minimisation:
         dt = stage.timestep_fs * FEMTOSECOND
-        if problem := check.failed_check(run.state, load, stage.scheme, dt, run.engine.extent(run.state)):
+        if problem := check.failed_check(run.part.state, load, stage.scheme, dt, run.engine.extent(run.part.state)):
             raise problem
 
 
@@ -114,7 +114,7 @@ class Sampler(Observer):
             raise problem
         self._check.rescale(kinetic)
         self.last_good = None  # its memory is free for the next
-        self.last_good = run.state.copy()
+        self.last_good = run.part.state.copy()
 
     @property
     def table(self) -> np.ndarray:
@@ -130,7 +130,7 @@ class Sampler(Observer):
         samples = self.samples
         names = ("step", "time", "stage", "conserved", "drift")
         steps, times, stages, conserved, drift = map(samples.__getitem__, names)
-        step, time = int(run.state.step[NOW]), float(run.state.time[NOW])
+        step, time = int(run.part.state.step[NOW]), float(run.part.state.time[NOW])
         series = ((steps, step), (times, time), (stages, len(samples.stages)))
         if not all(((of >= 0) & (of <= most)).all() and (np.diff(of) >= 0).all() for of, most in series):
             raise ValueError(f"its samples are not those of a run of {step} steps ({time:g} ps)")
@@ -141,7 +141,7 @@ class Sampler(Observer):
             raise ValueError("the drifts of its samples are not those of their energies")
         if len(samples):
             self._check.rescale(samples.row(-1).kinetic * KJ_PER_MOL)
-        self.last_good = run.state.copy()
+        self.last_good = run.part.state.copy()
 
     def failed(self, run: "Simulation") -> str:
         if run.folder is None or self.last_good is None:
@@ -175,5 +175,5 @@ class FinalState(Observer):
     _names = (FINAL,)
 
     def end(self, run: "Simulation", results: "Results") -> None:
-        write_state(run.path(FINAL), run.system.saved(run.state))
+        write_state(run.path(FINAL), run.system.saved(run.part.state))
         results.files.append(run.path(FINAL))

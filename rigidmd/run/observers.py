@@ -37,7 +37,7 @@ class Moment:
     """
 
     def __init__(self, run: "Simulation", step: int, time: float, stage: int):
-        self._run, self._state = run, run.state
+        self._run, self._state = run, run.part.state
         self.step, self.time, self.stage = step, time, stage
 
     def __repr__(self) -> str:
@@ -46,10 +46,7 @@ class Moment:
     @cached_property
     def state(self) -> State:
         """A copy of the state of the run, read-only."""
-        copy = self._state.copy()
-        for array in copy:
-            array.flags.writeable = False
-        return copy
+        return self._state.copy().read_only
 
     @cached_property
     def observation(self) -> Any:
@@ -256,14 +253,14 @@ class Frames(GrowingFile):
         from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
 
         if self.kept is None:
-            write_topology(run.path(self._names[0]), run.system, run.state, self._wrapped)
-        elif self.kept[-1:] != [len(self._frames)] or (self.times > run.state.time[NOW]).any():
+            write_topology(run.path(self._names[0]), run.system, run.part.state, self._wrapped)
+        elif self.kept[-1:] != [len(self._frames)] or (self.times > run.part.state.time[NOW]).any():
             raise ValueError("the times of its frames are not those of a run")
         path = run.path(self._names[1])
         self._file = open_trajectory(path, run.system, self.interval, self._velocities, self._wrapped, self.kept)
 
     def see(self, moment: Moment) -> None:
-        system, state = self._run.system, self._run.state
+        system, state = self._run.system, self._run.part.state
         if self._file is not None:
             self._file.write(state, moment.time, moment.step)
             self._frames.append(Frame(moment.time))

@@ -25,6 +25,7 @@ class RunPart:
     restore(kept) : return to a checkpoint, whose record is read; CheckpointError if it is of another scene, ValueError
         if it is invalid
     observe(moment) : the observation, which `Moment.observation` keeps
+    observe_now(), energy_now(), forces_now() : of the present state, for `Simulation`
     default_observers() : the observers that sample, check and write
     samples(), summary(samples, preparing, wall), summary_text(summary, known) : the samples; the summary, with seconds
         of preparing (compiling, removal of overlaps) and of segments with observers and output; the latter as text

@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from rigidmd.compile.machine import CODE_SETTINGS, PROCESSOR, PROCESSOR_FEATURES, SIMD_BITS
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import NOW, ORIGIN, STORED_NAMES, State
-from rigidmd.core.state_file import LARGEST, are_rotations, is_cell
-from rigidmd.errors import CheckpointError, SceneError
+from rigidmd.core.state_file import array_errors
+from rigidmd.errors import CheckpointError, SceneError, option
 from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.folder import elsewhere
 from rigidmd.scene import MolecularScene, Scene
 
 #: Packages that may change the last bits of a result.
@@ -124,7 +125,7 @@ def check_same_scene(scene: Scene, before: Mapping[str, Any], inputs: Mapping[st
     if changes:
         raise CheckpointError(
             f"{scene.source}: is not the scene of the run in the folder: {'; '.join(changes[:8])}. "
-            "--force begins a new run, -o names another folder"
+            f"{option('force')} begins a new run, {elsewhere()}"
         )
 
 
@@ -148,14 +149,13 @@ def state_from(arrays: Mapping[str, np.ndarray], like: State, exact: bool = True
     exact : whether the method of the run keeps rotation matrices orthogonal to rounding
     """
     found = State(*(np.array(arrays[name], order="C") for name in STORED_NAMES))
+    shapes = {name: expected.shape for name, expected in zip(STORED_NAMES, like, strict=True)}
+    for name, problem in array_errors(dict(zip(STORED_NAMES, found, strict=True)), shapes, exact).items():
+        raise ValueError(f"{name} of its state {problem}")
     for name, array, expected in zip(STORED_NAMES, found, like, strict=True):
-        if array.dtype != expected.dtype or array.shape != expected.shape:
-            raise ValueError(f"{name} has the shape {array.shape}, not {expected.shape}, or is of another type")
-        if name != "cell" and not (np.abs(array) <= LARGEST).all():
-            raise ValueError(f"{name} of its state is not finite")
-    if exact and not are_rotations(found.rotation):
-        raise ValueError("its state has matrices Q that are not rotations")
-    if not is_cell(found.cell) or (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
+        if array.dtype != expected.dtype:
+            raise ValueError(f"{name} of its state is of the type {array.dtype}, not {expected.dtype}")
+    if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():
         raise ValueError("its state has another kind of box")
     if not (0 <= found.step[ORIGIN] <= found.step[NOW] and 0 <= found.time[ORIGIN] <= found.time[NOW]):
         raise ValueError("its step or time is before the start")
@@ -234,5 +234,5 @@ def as_checkpoint_errors(folder: Path | None) -> Iterator[None]:
         yield
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
         raise CheckpointError(
-            f"the checkpoint in {folder} does not fit this run: {error}. --force begins a new run"
+            f"the checkpoint in {folder} does not fit this run: {error}. {option('force')} begins a new run"
         ) from None

@@ -15,10 +15,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+import numpy as np
+
 from rigidmd.compile.machine import MOST_THREADS
 from rigidmd.core.display import Displayed
 from rigidmd.core.state import State
 from rigidmd.errors import RigidMDError, RigidMDWarning, SceneError
+from rigidmd.io import folder as run_folder
 from rigidmd.io.progress import DisplayArea, announce, is_shown
 from rigidmd.io.scene_file import write_scene
 from rigidmd.run.loop import RunLoop
@@ -91,6 +94,7 @@ class Simulation(Displayed):
         self._progress: bool | None = None
         self._issued: list[str] = []  # warnings by this process
         self._loop: RunLoop | None = None  # the run, after it has begun and before it has ended
+        self._earlier: run_folder.RunMark | None = None  # of the last run by this object in the folder
         of_molecules = {"forces": forces, "thermostat": thermostat}
         self.part: Any  # a `RunPart`
         if isinstance(scene, BodyScene):
@@ -110,6 +114,10 @@ class Simulation(Displayed):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._summary_line}>"
 
+    def __reduce__(self) -> Any:
+        what = "a Simulation has compiled code and open files, and can be neither copied nor pickled"
+        raise TypeError(f"{what}: use simulation.scene and simulation.state.copy(), from which start_from begins")
+
     def __enter__(self) -> "Simulation":
         return self
 
@@ -124,8 +132,32 @@ class Simulation(Displayed):
 
     @property
     def state(self) -> State:
-        """The present state; the next step changes it in place."""
-        return self.part.state
+        """The present state, read-only: the next step changes it, a copy stays as it is.
+
+        For molecules in Å, Å/ps and u Å²/ps (angular momentum along principal axes), for a body in SI units. Runs begin
+        from another state by `start_from`.
+        """
+        return self.part.state.read_only
+
+    @property
+    def observation(self) -> Any:
+        """Observables of the present state, before, within and after a run; each use evaluates the forces.
+
+        An `Observation` of molecules, in kJ/mol, Å, K and bar, as in the log; the `Pose` of a body, in SI units.
+        Raises SimulationError if the forces cannot be evaluated.
+        """
+        return self.part.observe_now()
+
+    @property
+    def energy(self) -> float:
+        """Potential plus kinetic energy of the present state, kJ/mol, for a body J; `observation` has both."""
+        return self.part.energy_now()
+
+    @property
+    def forces(self) -> np.ndarray:
+        """Forces (n, 3) on the centres of mass at the present state, lab frame, kJ/mol/Å; on a body (1, 3) in N, empty
+        if it is pinned."""
+        return self.part.forces_now()
 
     @property
     def notes(self) -> list[str]:
@@ -171,8 +203,14 @@ class Simulation(Displayed):
         return part
 
     def start_from(self, state: State) -> None:
-        """Let runs of molecules begin at the given positions and momenta, without removal of overlaps."""
+        """Let runs of molecules begin at the given positions and momenta, without removal of overlaps.
+
+        state : of as many molecules in the same order, in the units of `state`, such as `results.state`. Time and step
+            begin at 0. Raises StructureError for a state that this scene cannot have, TypeError for anything else.
+        """
         self._molecules().start_from(state)
+        if self._earlier is not None:
+            self._earlier.is_complete = True  # the next run does not continue it
 
     def start(self) -> "OverlapRemoval | None":
         """Go to the state before the first step, from which `run` starts. Returns the removal of overlaps."""
@@ -198,6 +236,9 @@ class Simulation(Displayed):
 
     def run(self, progress: bool | None = None) -> Results:
         """Run the scene, or what remains of it after `step`, and complete all files.
+
+        After the end of a run, a call repeats it; in a folder it replaces the files of that run. A run in a folder that
+        was interrupted is continued from its last checkpoint. Without a folder there is none, and it begins anew.
 
         Raises OutputError (before computing), SimulationError if it fails, CheckpointError.
 
@@ -263,7 +304,11 @@ class Simulation(Displayed):
         """Let the run advance by at most this number of steps, or to its end. A new one begins after its end."""
         if self._loop is None:
             self._issued = []
-            self._loop = RunLoop(self, self._force, self._resume, self._deadline)
+            force, resume = self._force, self._resume
+            if not resume and self._earlier is not None and self._earlier.is_there:
+                resume = self._earlier.can_continue
+                force = force or not resume
+            self._loop = RunLoop(self, force, resume, self._deadline)
             _BEGUN.add(self)
         loop = self._loop
         if loop.is_running:
@@ -274,6 +319,8 @@ class Simulation(Displayed):
         finally:
             if loop.has_ended:
                 self._loop = None
+                if self.folder is not None and loop.has_begun:
+                    self._earlier = run_folder.RunMark(self.folder, loop.is_complete)
                 _BEGUN.discard(self)
         return loop
 

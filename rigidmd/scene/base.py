@@ -4,7 +4,7 @@
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, overload
 
@@ -19,7 +19,7 @@ from rigidmd.core.toml import (
     DEEPEST, TOMLDecodeError, impossible_values, parse_toml, parse_whole_number, plain_values, read_toml, shorten_repr,
     values_in,
 )  # fmt: skip
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, option
 from rigidmd.io.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
@@ -61,6 +61,7 @@ class Scene(Section, Displayed):
 
     _source: str = PrivateAttr("scene")
     _folder: Path = PrivateAttr(Path())
+    _read_in: Path = PrivateAttr(default_factory=lambda: _working_directory())  # from which `_folder` begins
     _embedded_files: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     @field_validator("integrators")
@@ -100,11 +101,12 @@ class Scene(Section, Displayed):
 
     def with_end(self, time: float) -> "Scene":
         """The same scene with its end at a time of the run, ps. Raises SceneError if the end cannot be set."""
-        raise SceneError(self.source, ["--until is for molecules; set run.duration_s of a single body"])
+        raise SceneError(self.source, [f"{option('until')} is for molecules; set run.duration_s of a single body"])
 
     def path(self, file: str) -> Path:
-        """Path of a file that the scene names relative to its folder."""
-        return self._folder / file
+        """Path of a file that the scene names relative to its folder, absolute if the working directory has changed."""
+        is_same = _working_directory() == self._read_in
+        return (self._folder if is_same else self._read_in / self._folder) / file
 
     @property
     def inputs(self) -> dict[str, Path]:
@@ -254,6 +256,30 @@ def _other_kind_of_file(path: Path) -> str:
         key = f'[structure] file = "{path.name}"'
         return f"is a {kind} file, not a scene: a scene names it by {key}; see `rigidmd help structures`"
     return ""
+
+
+def _working_directory() -> Path:
+    """The working directory; empty if it has been removed."""
+    try:
+        return Path.cwd()
+    except OSError:
+        return Path()
+
+
+def with_absolute_paths(data: Mapping[str, Any], folder: PathName = "") -> dict[str, Any]:
+    """A copy of the tables of a scene in which every path, relative to a folder, is absolute.
+
+    folder : default: the working directory
+    """
+    copy = plain_values(data)
+    for keys, name in [*values_in(copy)]:
+        if isinstance(name, str) and FILE_KEYS.fullmatch(".".join(map(str, keys))):
+            *parents, last = keys
+            table = copy
+            for key in parents:
+                table = table[key]
+            table[last] = os.path.abspath(os.path.join(folder, name))
+    return copy
 
 
 def default_name(path: Path) -> str:

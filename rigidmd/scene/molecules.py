@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypedDict
 from pydantic import Field, PrivateAttr, Strict
 
 from rigidmd.core.plain_text import distinct
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, option
 from rigidmd.io.formats import BY_EXTENSION, TOPOLOGIES, TOPOLOGY, TRAJECTORY, format_of, written
 from rigidmd.scene.base import Scene, file_name, is_inside
 from rigidmd.scene.engine import EngineChoice
@@ -199,11 +199,11 @@ class MolecularScene(Scene):
         last = self.stages[-1]
         if last.is_minimisation or last.ramps:
             what = "is a minimisation" if last.is_minimisation else "changes temperature or pressure over its duration"
-            raise SceneError(self.source, [f"the last stage {what}: --until cannot set its end"])
+            raise SceneError(self.source, [f"the last stage {what}: {option('until')} cannot set its end"])
         if not time > before:
-            raise SceneError(self.source, [f"--until {time:g} ps: the last stage begins at {before:g} ps"])
+            raise SceneError(self.source, [f"{option('until')} {time:g} ps: the last stage begins at {before:g} ps"])
         if not (time - before) * 1000 / last.timestep_fs < MOST_STEPS:
-            raise SceneError(self.source, [f"--until {time:g} ps is more than {MOST_STEPS:g} steps away"])
+            raise SceneError(self.source, [f"{option('until')} {time:g} ps is more than {MOST_STEPS:g} steps away"])
         stages = (*self.stages[:-1], last.model_copy(update={"duration_ps": time - before}))
         return self.model_copy(update={"stages": stages})
 

@@ -29,7 +29,7 @@ from rigidmd.scene.engine import EngineChoice
 from rigidmd.scene.stage import Stage
 from rigidmd.units import FEMTOSECOND
 
-#: File that lists what an export wrote in its folder; --force replaces the files of an export only.
+#: File that lists what an export wrote in its folder; `force` replaces the files of an export only.
 MARKER = ".rigidmd-export"
 
 

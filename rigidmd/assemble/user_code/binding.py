@@ -16,7 +16,8 @@ from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS
-from rigidmd.engines.cpu.engine import CompileError
+from rigidmd.engines.cpu.engine import BOX, LOAD, TRAJECTORY, CompileError
+from rigidmd.engines.samples import IN_LOGS
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, describe_error
 from rigidmd.forces.neighbors.pair_loop import PairForces
@@ -24,6 +25,13 @@ from rigidmd.forces.parts import Tail, sum_of_tails
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.forces import CustomForce
 from rigidmd.scene.molecules import name_of
+
+#: Names that a force cannot have, and what they are.
+RESERVED = {
+    **dict.fromkeys((LOAD, BOX, TRAJECTORY), "the name of a part of checkpoints"),
+    **dict.fromkeys(("tail", "lennard_jones_tail"), "the name of the energy of the tail correction"),
+    **dict.fromkeys(IN_LOGS, "a column of the log"),
+}
 
 
 def custom_forces(scene: MolecularScene) -> list[Any]:
@@ -85,7 +93,9 @@ def with_user_code(system: System) -> System:
     wanted = [*(entry.name for entry in scene.forces.custom), *map(name_of, added)]
     names = distinct(wanted, [*system.terms, *system.constants])
     found = replace(system, python_forces={}, thermostat=thermostat, user_terms={}, notes=[*system.notes])
-    terms, tails, faults = {}, [] if system.tail is None else [system.tail], []
+    found = replace(found, warnings=[*system.warnings])
+    terms, tails = {}, [] if system.tail is None else [system.tail]
+    faults = [f"{name} is {RESERVED[name]}; name the force otherwise" for name in names if name in RESERVED]
     changed = np.zeros(3, bool)  # whether they may change components of the total momentum
     for name, made in zip(names, forces, strict=True):
         try:
@@ -115,10 +125,11 @@ def _term(made: Any, name: str, system: System, found: System, tails: list[Tail]
     """The term of one object for a system. Its function, description and notes are added to `found`, its tail
     correction to `tails`. Raises PairPotentialError, ValueError, UserForceError."""
     if isinstance(made, PairLaw):
-        term, formula, tail, notes = made.bind(system)
+        term, formula, tail, notes, warnings = made.bind(system)
         if formula.error:
             found.notes.append(f"{name}: the error of its spline is {formula.error:.1e} of its deepest energy")
         found.notes.extend(f"{name}: {note}" for note in notes)
+        found.warnings.extend(f"{name} {warning}" for warning in warnings)
         tails += [] if tail is None else [tail]
         cutoff, truncation = made.cutoff_A or system.cutoff, made.truncation or system.scene.forces.truncation
         reach = f"cutoff {cutoff:g} Å, {truncation}" if cutoff < inf else "no cutoff"

@@ -104,7 +104,7 @@ class BoundForce:
         self._fill(workspace.torque_body, torque if len(state.rotation) else None, "torques")
         if not np.isfinite(energy):
             raise self._error(f"the energy {energy}")
-        numbers = np.zeros((3, 3)) if virial is None else _numbers(virial)
+        numbers = np.zeros((3, 3)) if virial is None else real_numbers(virial)
         if numbers is None or numbers.shape != (3, 3) or not np.isfinite(numbers).all():
             raise self._error(f"{virial!r:.60} as its virial, not (3, 3) finite numbers")
         workspace.tally[0] = energy * KJ_PER_MOL
@@ -143,9 +143,10 @@ class BoundForce:
         if given is None:
             target[:] = 0.0
             return
-        array = _numbers(given)
+        array = real_numbers(given)
         if array is None:
-            raise self._error(f"{given!r:.60} as {what}, not real numbers of the shape {target.shape}")
+            kind = "masked or complex values" if hasattr(given, "dtype") else f"{given!r:.60}"
+            raise self._error(f"{kind} as {what}, not real numbers of the shape {target.shape}")
         if array.shape != target.shape:
             raise self._error(f"{what} of the shape {array.shape}, not {target.shape}")
         if not np.isfinite(array).all():
@@ -169,10 +170,10 @@ class BoundForce:
             raise UserForceError(f"{what} of the force {self.name} raised {describe_error(error)}{where}") from error
 
 
-def _numbers(given: Any) -> np.ndarray | None:
-    """An array of real numbers; None for anything else."""
+def real_numbers(given: Any) -> np.ndarray | None:
+    """An array of real numbers; None for anything else, such as complex numbers and masked values."""
     try:
-        return None if np.iscomplexobj(given) else np.asarray(given, float)
+        return None if np.iscomplexobj(given) or np.ma.is_masked(given) else np.asarray(given, float)
     except (TypeError, ValueError):
         return None
 

@@ -17,7 +17,7 @@ from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, inner_pairs, sites_named, sum_of_tails
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
-    DISTANCE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table,
+    DISTANCE, LARGEST_VALUE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table,
 )  # fmt: skip
 from rigidmd.forces.potentials.truncation import (
     MINIMUM_TOLERANCE, TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
@@ -25,10 +25,16 @@ from rigidmd.forces.potentials.truncation import (
 )  # fmt: skip
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 Rule = Literal["geometric", "arithmetic", "harmonic"]
 RULES: tuple[str, ...] = get_args(Rule)
 Parameters = Mapping[str, float]
+#: Largest energy at the cutoff without a warning, in kT, see `_ValuesAtCutoff.lost`. Lennard-Jones forces with usual
+#: cutoffs have 0.02 to 0.05.
+LARGEST_AT_CUTOFF = 0.2
+#: Largest error of the spline of a table without a warning, relative to its deepest energy.
+SPLINE_ERROR = 0.01
 #: A minimum is searched up to this multiple of the cutoff.
 REACH = 20.0
 #: Columns of the file of a tabulated potential, of which the last may be missing; the names have the units.
@@ -43,6 +49,16 @@ class Columns(NamedTuple):
     energy: Sequence[float]  # kJ/mol
     force: Sequence[float] | None = None  # -dE/dr, kJ/mol/Å
     name: str = "a table"  # for messages
+
+
+class BoundPotential(NamedTuple):
+    """A pair potential between the sites of a system."""
+
+    term: PairForces
+    formula: Formula
+    tail: Tail | None  # where the scene has forces.tail_correction
+    notes: list[str]
+    warnings: list[str]
 
 
 class PairPotentialError(ValueError):
@@ -84,9 +100,8 @@ class PairLaw:
             raise PairPotentialError(str(error)) from None
         return not_none(self.formula_of_function)
 
-    def bind(self, system: System) -> tuple[PairForces, Formula, Tail | None, list[str]]:
-        """The potential between the sites of a system: its term, formula, tail correction if the scene has it, notes.
-        Raises PairPotentialError with all errors."""
+    def bind(self, system: System) -> BoundPotential:
+        """The potential between the sites of a system. Raises PairPotentialError with all errors."""
         forces = system.scene.forces
         cutoff = self.cutoff_A or system.cutoff
         check_cutoff(cutoff, system)
@@ -115,6 +130,8 @@ class PairLaw:
         inner = inner_pairs(kinds, offsets, np.bincount(index, minlength=len(system.species)))
         faults: list[str] = []
         short: list[tuple[float, str]] = []
+        unfinished: list[tuple[float, str]] = []
+        thermal, scale = energy_scale(system)
         for i, j, of_pair in types.pairs(faults):
             try:
                 numbers[:, i, j], radial = formula.numbers(of_pair), formula.radial(of_pair)
@@ -131,8 +148,12 @@ class PairLaw:
             except (FormulaError, ArithmeticError, ValueError, TypeError) as error:
                 faults.append(f"between {types.example(i)} and {types.example(j)}: {error}")
             else:
+                between = f"{types.example(i)} and {types.example(j)}"
                 if minimum := _minimum_beyond(cutoff, radial):
-                    short.append((minimum, f"{types.example(i)} and {types.example(j)}"))
+                    short.append((minimum, between))
+                end = _ValuesAtCutoff.of(radial, cutoff, ends_there=bool(formula.shared))
+                if end.lost(name) > LARGEST_AT_CUTOFF * thermal:
+                    unfinished.append((end.lost(name), end.describe(between, name, thermal, scale)))
             numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
             acts[i, j] = acts[j, i] = 1.0
         if faults:
@@ -147,7 +168,57 @@ class PairLaw:
         )  # fmt: skip
         term = pair_forces(potential, sites, exclusion_groups(sites, (system.model.inverse_mass == 0)[index]))
         notes = [short_cutoff_note(cutoff, max(short)[1], max(short)[0])] if short else []
-        return term, formula, sum_of_tails(tails), notes
+        warnings = [max(unfinished)[1]] if unfinished else []
+        if formula.error > SPLINE_ERROR:
+            advice = "use smaller intervals"
+            warnings.append(f"the error of its spline is {formula.error:.1e} of its deepest energy: {advice}")
+        return BoundPotential(term, formula, sum_of_tails(tails), notes, warnings)
+
+
+class _ValuesAtCutoff(NamedTuple):
+    """A pair potential where it is cut off, u Å²/ps²."""
+
+    cutoff: float  # Å
+    energy: float
+    force: float
+    change: float  # largest change of the energy up to twice the cutoff; 0 if the potential ends at its cutoff
+
+    @classmethod
+    def of(cls, radial: Callable[[float], tuple], cutoff: float, ends_there: bool) -> "_ValuesAtCutoff":
+        """ends_there : whether the potential is not known beyond the cutoff"""
+        if cutoff == inf:
+            return cls(cutoff, 0.0, 0.0, 0.0)
+        energy, force, _ = radial(cutoff)
+        beyond = [] if ends_there else [abs(radial(x * cutoff)[0] - energy) for x in (1.25, 1.5, 2.0)]
+        return cls(cutoff, energy, force, max([x for x in beyond if isfinite(x)], default=0.0))
+
+    def lost(self, truncation: TruncationName) -> float:
+        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and the work of the force
+        over a tenth of the cutoff, whichever is largest."""
+        jump = abs(self.energy) if truncation == "plain" else 0.0
+        return max(jump, self.change, 0.1 * self.cutoff * abs(self.force))
+
+    def describe(self, between: str, truncation: TruncationName, thermal: float, scale: str) -> str:
+        """A sentence. scale : what `thermal` is, such as kT at 298 K"""
+        energy, force = (f"{value / KJ_PER_MOL:.3g}" for value in (self.energy, self.force))
+        text = (
+            f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of {self.cutoff:g} Å "
+            f"with truncation = {truncation}, between {between}, and its force is {force} kJ/mol/Å; beyond "
+            "it does not act"
+        )
+        if self.change > abs(self.energy):
+            text += f", where it would change by {self.change / thermal:.2g} {scale}"
+        return f"{text}. Use a longer cutoff, or an energy that vanishes there"
+
+
+def energy_scale(system: System) -> tuple[float, str]:
+    """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its name; 0 without."""
+    scene = system.scene
+    temperatures = [x for stage in scene.stages for x in stage.temperatures if x > 0]
+    temperature = min(temperatures, default=scene.start.temperature_K or 0.0)
+    if temperature:
+        return BOLTZMANN * temperature, f"kT at {temperature:g} K"
+    return max((float(m.epsilon.max()) for m in system.species), default=0.0) or inf, "of the deepest well"
 
 
 def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
@@ -373,6 +444,9 @@ def read_columns(path: Path) -> Columns:
             faults.append(f"line {number}: has {len(words)} numbers, {must}")
         elif not all(map(isfinite, values)):
             faults.append(f"line {number}: {' '.join(words):.60} has something else than finite numbers")
+        elif max(map(abs, values)) > LARGEST_VALUE:
+            largest = f"a number above {LARGEST_VALUE:g}, the largest of a table"
+            faults.append(f"line {number}: {' '.join(words):.60} has {largest}: begin it at larger distances")
         elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
             least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance" if rows else "0"
             faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")

@@ -24,6 +24,14 @@ LEAST_ROWS = 8  #: of a table of a user
 #: Largest difference of an energy and the trapezoidal integral of its force between two rows, relative to the largest
 #: change of the energy between rows.
 WRONG_FORCE = 0.3
+#: Largest absolute value of an energy (kJ/mol) or a force of a table: products of a few are finite.
+LARGEST_VALUE = 1e30
+#: Neighbouring intervals of a table that differ by more than this factor separate parts of it. A part
+#: of longer intervals than its neighbour with fewer than LEAST_ROWS of them is a gap: it is not known how
+#: far the spline is off in it.
+UNEQUAL = 3.0
+#: Largest error of the spline of a table, relative to its deepest energy.
+LARGEST_ERROR = 0.1
 
 
 class Formula(NamedTuple):
@@ -134,8 +142,8 @@ def formula_of_table(
     The table is interpolated by a cubic spline, or by cubics with the given forces -dE/dr (kJ/mol/Å) at the distances,
     and tabulated again at equal steps of r² for the pair loop. The force is the derivative of that table. Nearer than
     the first distance a the energy is E(a) + a F(a)/12 ((a/r)¹² - 1), down to a/2, and a straight line in r² below.
-    `error` is the error of the spline, estimated by one through every second value and divided by 16 for its order,
-    plus the error of the second table. Raises FormulaError.
+    `error` is the error of the spline, which has the order 4, estimated by its difference from one through every second
+    value, plus the error of the second table. Raises FormulaError, also for gaps in the table and for large errors.
     """
     try:
         r, u = np.asarray(distance, float), np.asarray(energy, float)
@@ -149,10 +157,16 @@ def formula_of_table(
     finite = np.isfinite(r).all() and np.isfinite(u).all() and (f is None or np.isfinite(f).all())
     if not (finite and (np.diff(r) > 0).all() and r[0] > 0):
         raise FormulaError(f"{name} needs ascending distances above 0, and finite energies")
+    size_of_rows = np.max(np.abs(np.array([u] if f is None else [u, f])), axis=0)
+    if size_of_rows.max() > LARGEST_VALUE:
+        row = int(size_of_rows.argmax())
+        least = "begin it at larger distances: nearer than its first one the energy rises as r⁻¹²"
+        raise FormulaError(f"{name} has {size_of_rows[row]:g} at {r[row]:g} Å, more than {LARGEST_VALUE:g}; {least}")
     if cutoff == inf or r[-1] < cutoff * (1 - 1e-12):
         unit = "; is it in nm?" if r[-1] < 3 < cutoff <= 10 * r[-1] * 1.01 else ""
         raise FormulaError(f"{name} ends at {r[-1]:g} Å, before the cutoff of {cutoff:g} Å{unit}")
 
+    _check_intervals(name, r, cutoff)
     size = np.abs(u[u <= 0]).max(initial=0.0) or np.abs(u).max()
     if f is not None:
         _check_forces(name, r, u, f, 10 * size)
@@ -171,8 +185,15 @@ def formula_of_table(
     middle = np.sqrt(0.5 * (square[1:] + square[:-1]))
     near = middle[spline(middle) < 10 * KJ_PER_MOL * size]
     near = near[near <= r[::2][-1]]
-    error = np.abs(coarse(near) - spline(near)).max(initial=0.0) / 16
+    # of the order of the fourth power of an interval, of the spline and of the one through every second value
+    fine, twice = (_interval_at(near, distances) ** 4 for distances in (r, r[::2]))
+    error = np.abs((coarse(near) - spline(near)) * fine / (twice - fine)).max(initial=0.0)
     error = float(error + np.abs(read(near**2) - spline(near)).max(initial=0.0)) / (KJ_PER_MOL * size)
+    if error > LARGEST_ERROR:
+        raise FormulaError(
+            f"{name}: the error of its spline is {error:.2g} of its deepest energy, {size:.3g} kJ/mol, must be below "
+            f"{LARGEST_ERROR:g}. Use smaller intervals, and check its rows for slips"
+        )
     if (steps := int(0.75 * square[0] / step)) > 0:
         inner = square[0] - step * np.arange(steps, -1, -1.0)
         six = (square[0] / inner) ** 6
@@ -194,6 +215,27 @@ def formula_of_table(
     table = Table(float(read.x[0]), float(1 / step), coefficients)
     text = f"{name} of {len(r)} energies from {r[0]:g} to {r[-1]:g} Å"
     return Formula(text, ("scale",), lambda values: (values["scale"],), radial, Tabulated, table, error)
+
+
+def _interval_at(distance: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Length (k,) of the interval between rows (n,) that contains each distance (k,)."""
+    return np.diff(rows)[np.clip(np.searchsorted(rows, distance) - 1, 0, len(rows) - 2)]
+
+
+def _check_intervals(name: str, r: np.ndarray, cutoff: float) -> None:
+    """Raise FormulaError if distances r have a gap before the cutoff, see UNEQUAL."""
+    length = np.diff(r)
+    ratio = length[1:] / length[:-1]
+    begins = [0, *(np.flatnonzero((ratio > UNEQUAL) | (ratio < 1 / UNEQUAL)) + 1).tolist(), len(length)]
+    for first, end in itertools.pairwise(begins):
+        beside = [length[k] for k in (first - 1, end) if 0 <= k < len(length)]
+        if beside and end - first < LEAST_ROWS and length[first:end].min() > min(beside) and r[first] < cutoff:
+            k = first + int(length[first:end].argmax())
+            raise FormulaError(
+                f"{name} has a gap from {r[k]:g} to {r[k + 1]:g} Å, next to intervals of "
+                f"{min(beside):.3g} Å: the energy in between is not known. Fill it, or use similar "
+                "intervals everywhere"
+            )
 
 
 def _check_forces(name: str, r: np.ndarray, u: np.ndarray, f: np.ndarray, high: float) -> None:

@@ -1,10 +1,11 @@
 """The longest stable time step, estimated before the first step from the stiffest motion of a state."""
 
-from math import sqrt
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.time_step import INACCURATE, stable_angle, step_error
 from rigidmd.core.integrators import Scheme
 from rigidmd.core.state import Load, State
 from rigidmd.engines.body_system import BodySystem
@@ -88,6 +89,23 @@ def stiffest_mode(system: System, state: State, engine: Engine | None = None) ->
 def _product(a: np.ndarray, b: np.ndarray) -> float:
     """Scalar product of long vectors. `a @ b` would start threads that then spin on cores that a run needs."""
     return float(np.einsum("i,i", a, b))
+
+
+def body_step_warnings(system: BodySystem) -> list[str]:
+    """Warnings of a step that is unstable or inaccurate for the motion of a body at its start."""
+    run, method = system.scene.run, system.method
+    rate, angle = fastest_body_rate(system), stable_angle(method)
+    if not system.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
+        return []
+    moves = f"at its start the body swings or spins at {rate:.3g} rad/s"
+    if run.timestep_s > angle / rate:
+        follows = f"which {run.integrator} can follow up to {angle / rate:.3g} s"
+        return [f"timestep_s = {run.timestep_s:g} is longer than what is stable: {moves}, {follows}"]
+    error = step_error(method, rate * run.timestep_s) if isinstance(method, Scheme) else 0.0
+    if error > INACCURATE:
+        what = f"as if its torques were wrong by {error:.0%}"
+        return [f"timestep_s = {run.timestep_s:g} is inaccurate: {moves}, which {run.integrator} follows {what}"]
+    return []
 
 
 def fastest_body_rate(system: BodySystem) -> float:

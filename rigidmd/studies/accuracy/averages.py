@@ -231,7 +231,7 @@ def start_of_last_stage(scene: MolecularScene) -> tuple[Simulation, State]:
         scale_to_mean_box(simulation.system, results.state, cast(Samples, results.samples), len(scene.stages) - 1)
         return simulation, results.state
     simulation.start()
-    return simulation, simulation.state
+    return simulation, simulation.state.copy()
 
 
 def _with_thermostat(scene: MolecularScene) -> Stage:

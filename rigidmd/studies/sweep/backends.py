@@ -31,7 +31,7 @@ from filelock import FileLock, Timeout
 
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.process import python_process, without_local_settings
-from rigidmd.errors import OutputError, RigidMDError, SettingError
+from rigidmd.errors import OutputError, RigidMDError, SettingError, option
 from rigidmd.io.folder import LOCK
 from rigidmd.studies.sweep.folder import STOP, State, SweepPoint, state_on_disk
 
@@ -118,7 +118,8 @@ class Worker:
         lines = self._stderr.read().decode(errors="replace").strip()[-LAST_LETTERS:].splitlines()
         last = f": {lines[-1]}" if lines else ""
         if code == -signal.SIGKILL:
-            return "its process was killed, perhaps because memory was full (run fewer points at a time: --jobs)"
+            advice = f"run fewer points at a time: {option('jobs')}"
+            return f"its process was killed, perhaps because memory was full ({advice})"
         if code < 0:
             return f"its process was ended by {signal.Signals(-code).name}{last}"
         return f"its process ended with exit code {code}{last}"
@@ -277,7 +278,7 @@ def run_task(task: PointTask, send: Send = lambda kind, value: None, progress: b
     except KeyboardInterrupt:
         ended["state"] = "interrupted"
     except MemoryError:
-        ended["message"] = "not enough memory; run fewer points at a time (--jobs)"
+        ended["message"] = f"not enough memory; run fewer points at a time ({option('jobs')})"
     except Exception as error:
         traceback.print_exc()
         ended["message"] = f"{type(error).__name__}: {error}"

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from rigidmd.core.files import writing
-from rigidmd.errors import OutputError
+from rigidmd.errors import OutputError, option
 from rigidmd.io.folder import LOCK, MARKER, SUMMARY, SWEEP, check_inside, offsets_of, written_by_runs
 from rigidmd.io.run_files import Bounded, Summary, read_json
 from rigidmd.io.write import write_json
@@ -78,7 +78,7 @@ def is_sweep(folder: Path) -> bool:
 
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a sweep. Raises OutputError."""
-    path, remedy = folder / MANIFEST, "; --force begins the sweep anew"
+    path, remedy = folder / MANIFEST, f"; {option('force')} begins the sweep anew"
     schema = read_json(path, ManifestVersion, remedy)
     if schema is None:
         raise OutputError(f"{folder} holds no sweep; `rigidmd sweep SCENE --set ...` makes one")

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 from rigidmd.assemble.scenes import resolve
 from rigidmd.core.toml import parse_whole_number, plain_values, shorten_repr
-from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError
+from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError, option
+from rigidmd.io.folder import elsewhere
 from rigidmd.run.resume import NOT_COMPARED, differences, file_digest, input_digests, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
 from rigidmd.studies.sweep.folder import (
@@ -146,10 +147,10 @@ def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
 def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, Any]) -> list[Axis]:
     """The axes with an axis of the seeds of replicas."""
     if "body" in data:
-        raise SceneError("--replicas", [f"{scene} is a single body, whose motion has no seed"])
+        raise SceneError(option("replicas"), [f"{scene} is a single body, whose motion has no seed"])
     with_seed = [axis for axis in axes if SEED in axis.keys]
     if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
-        raise SceneError("--replicas", ["sets seeds, and --set sets them too; leave out one of them"])
+        raise SceneError(option("replicas"), ["sets seeds, and --set sets them too; leave out one of them"])
     seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
         raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be an integer"])
@@ -241,8 +242,8 @@ def merge_manifests(folder: Path, fresh: Manifest, force: bool) -> Manifest:
     if found := _differences_between(there, fresh):
         shown = found[:MOST_SHOWN] + ([f"and {len(found) - MOST_SHOWN} more"] if len(found) > MOST_SHOWN else [])
         raise OutputError(
-            f"{folder} holds a sweep of another scene: {'; '.join(shown)}. --force begins it anew, -o names another "
-            "folder"
+            f"{folder} holds a sweep of another scene: {'; '.join(shown)}. {option('force')} begins it anew, "
+            f"{elsewhere()}"
         )
     known = {point.folder for point in there.points}
     fresh.points = [*there.points, *(point for point in fresh.points if point.folder not in known)]

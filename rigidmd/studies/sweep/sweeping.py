@@ -18,7 +18,7 @@ from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
 from rigidmd.errors import OutputError, SceneError, SimulationError
-from rigidmd.io.folder import FolderLock, add_to_folder, is_empty
+from rigidmd.io.folder import FolderLock, add_to_folder, elsewhere, is_empty
 from rigidmd.io.progress import Bar, progress_of
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
 from rigidmd.run.schedule import checked_walltime, signal_handler
@@ -92,15 +92,15 @@ def open_sweep(
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
     folder = folder or Path("runs") / f"{named or default_name(scene)}-sweep"
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name another folder with -o")
+        raise OutputError(f"{folder} is a file; {elsewhere()}")
     if not is_empty(folder) and not is_sweep(folder):
-        raise OutputError(f"{folder} is not empty and holds no sweep; name another folder with -o")
+        raise OutputError(f"{folder} is not empty and holds no sweep; {elsewhere()}")
     fresh, is_body = read_points(scene, axes if force else order_axes(folder, axes))
     if step is not None:
         step_key(fresh, step, Scene.read(scene, fresh.overrides(fresh.points[0])))
     lock = stack.enter_context(FolderLock(folder))
     manifest = merge_manifests(folder, fresh, force)
-    with writing(folder, "made", "; name another folder with -o"):
+    with writing(folder, "made", f"; {elsewhere()}"):
         folder.mkdir(parents=True, exist_ok=True)
     add_to_folder(folder, FILES)
     lock.take()  # of a new folder
@@ -221,7 +221,7 @@ def write_slurm_script(
     if unsafe := [text for text in (*words, str(path), here) if UNSAFE.search(text)]:
         raise OutputError(
             f"{unsafe[0]!r} has a control character, a quotation mark or a backslash in its name, which the script of "
-            "a job cannot have; rename it, or name another folder with -o"
+            f"a job cannot have; rename it, or {elsewhere()}"
         )
     text = SLURM_SCRIPT.format(
         count=len(left), name=in_comment(manifest.name), job=f"{as_word(manifest.name)}-sweep",

@@ -1,0 +1,168 @@
+"""Numbers in another unit are told with the likely cause; shipped models and scenes give no warning."""
+
+import numpy as np
+import pytest
+from scenes import GOOD
+from support import MOLECULES, ROOT, build, load_model, small_scene
+
+import rigidmd
+from rigidmd.assemble.plausibility import molecule_warnings
+from rigidmd.commands.cli import main
+from rigidmd.errors import SceneError
+from rigidmd.scene import Scene
+from rigidmd.scene.models import available_models
+
+ARGON = {"name": "Ar", "element": "Ar", "mass_u": 39.948, "position_A": [0.0, 0.0, 0.0], "sigma_A": 3.4,
+         "epsilon_kJ_mol": 1.0}  # fmt: skip
+OXYGEN = {"name": "O", "element": "O", "mass_u": 15.999, "position_A": [0.0, 0.0, 0.0], "sigma_A": 3.2,
+          "epsilon_kJ_mol": 0.65}  # fmt: skip
+HYDROGEN = {"name": "H", "element": "H", "mass_u": 1.008, "position_A": [0.9572, 0.0, 0.0], "charge_e": 0.4}
+
+
+def of_sites(*sites, count=2, edge=30.0, **tables):
+    molecules = [{"name": "mine", "count": count, "sites": list(sites)}]
+    forces = {"cutoff_A": 10.0, "electrostatics": "none"}
+    return small_scene({}, edge, molecules=molecules, **{"forces": forces} | tables)
+
+
+@pytest.mark.parametrize(
+    ("sites", "cause"),
+    [
+        ([OXYGEN | {"mass_u": 1.6}, HYDROGEN], "mass_u of O is 1.6 u, and O has 16 u"),
+        ([OXYGEN, HYDROGEN | {"mass_u": 10.08}], "mass_u of H is 10.08 u, and H has 1.008 u"),
+        ([OXYGEN, HYDROGEN | {"position_A": [0.09572, 0.0, 0.0]}], "0.09572 Å, below 0.5: are the positions in nm?"),
+        ([OXYGEN, HYDROGEN | {"position_A": [95.72, 0.0, 0.0]}], "95.72 Å, above 15: are the positions in pm?"),
+        ([ARGON | {"sigma_A": 0.34}], "largest sigma_A is 0.34 Å, below 0.9: is it in nm?"),
+        ([ARGON | {"epsilon_kJ_mol": 996.0}], "well depth is 996 kJ/mol, above 40: is it in J/mol or in K?"),
+        ([ARGON | {"epsilon_kJ_mol": 119.8}], "is it in J/mol or in K?"),
+        ([OXYGEN | {"charge_e": -0.4}, HYDROGEN | {"charge_e": 6.4e-20}], "charge_e of H is 6.4e-20 e"),
+        ([OXYGEN | {"element": "X", "mass_u": 2.7e-26}], "mass_u of O is 2.7e-26 u, below 0.1: is it in kg or g?"),
+    ],
+)
+def test_a_model_in_another_unit(sites, cause):
+    edge = 400.0 if "pm" in cause else 30.0
+    warnings = build(of_sites(*sites, edge=edge)).warnings
+    assert any(cause in warning for warning in warnings), warnings
+
+
+@pytest.mark.parametrize("site", [
+    ARGON, OXYGEN | {"mass_u": 17.007}, HYDROGEN | {"mass_u": 2.014}, HYDROGEN | {"mass_u": 3.024},
+    ARGON | {"element": "C", "mass_u": 16.043}, ARGON | {"element": "C", "mass_u": 14.027},
+    ARGON | {"element": "Li", "mass_u": 6.015},
+])  # fmt: skip
+def test_isotopes_and_united_atoms_are_what_they_are(site):
+    assert build(of_sites(site)).warnings == []
+
+
+@pytest.mark.parametrize("name", available_models())
+def test_no_shipped_model_is_suspected(name):
+    assert molecule_warnings(load_model(name)) == []
+
+
+@pytest.mark.parametrize("path", MOLECULES, ids=lambda path: path.stem)
+def test_no_shipped_scene_is_suspected(path):
+    assert build(Scene.read(path)).warnings == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "systems").glob("*.toml")), ids=lambda path: path.stem)
+def test_no_shipped_body_is_suspected(path, capsys):
+    if path in MOLECULES:
+        pytest.skip("of molecules")
+    assert main(["check", str(path)]) == 0
+    assert capsys.readouterr().err == ""
+
+
+NPT = {"ensemble": "npt", "temperature_K": 90.0, "duration_ps": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("tables", "cause"),
+    [
+        ({"stages": [NPT | {"pressure_bar": 101325.0}]}, "1 atm is 101325 Pa, or 1.01325 bar"),
+        ({"stages": [NPT | {"pressure_bar": 1e5}]}, "1 atm is 101325 Pa"),
+        ({"stages": [NPT | {"pressure_bar": 2e6}]}, "stages.0.pressure_bar is 2e+06 bar, above 50000: is it in Pa?"),
+        ({"fields": {"gravity_m_s2": [0.0, 0.0, 9.81]}}, "points up, along +z: should it be [0, 0, -9.81]?"),
+        ({"fields": {"gravity_m_s2": [0.0, 0.0, -981.0]}}, "is 981 m/s², above 500: is it in cm/s²?"),
+        ({"fields": {"electric_V_per_nm": [0.0, 1e8, 0.0]}}, "fields.electric_V_per_nm is 1e+08 V/nm"),
+    ],
+)
+def test_a_scene_in_another_unit(tables, cause):
+    charged = [ARGON | {"charge_e": 1.0}, ARGON | {"name": "Cl", "charge_e": -1.0, "position_A": [2.5, 0.0, 0.0]}]
+    edge = None if "gravity_m_s2" in tables.get("fields", {}) else 30.0  # what falls needs no box
+    warnings = build(of_sites(*charged, edge=edge, **tables)).warnings
+    assert any(cause in warning for warning in warnings), warnings
+
+
+def test_water_at_25_kelvin():
+    stages = [{"ensemble": "nvt", "temperature_K": 25.0, "duration_ps": 0.01}]
+    assert "is it in °C?" in build(small_scene({"spce": 20}, 20.0, stages=stages)).warnings[0]
+    stages[0]["temperature_K"] = 298.0
+    assert build(small_scene({"spce": 20}, 20.0, stages=stages)).warnings == []
+
+
+@pytest.mark.parametrize("cutoff", [1e-9, 0.9])
+def test_a_cutoff_within_the_molecules_is_refused(cutoff):
+    with pytest.raises(SceneError, match=r"forces.cutoff_A is .* touch at 3.8\d Å"):
+        build(small_scene({"argon": 20}, 25.0, forces={"cutoff_A": cutoff}))
+    with pytest.raises(SceneError, match=r"forces.cutoff_A is 10 Å, .* touch at"):
+        build(of_sites(ARGON | {"sigma_A": 1e6}))
+
+
+def test_a_cutoff_below_contact_has_no_tail_correction():
+    """Its integral would be one over overlaps."""
+    for cutoff, has_tail in ((3.0, False), (4.0, True)):
+        forces = {"cutoff_A": cutoff, "tail_correction": None}
+        system = build(small_scene({"argon": 100}, 18.0, forces=forces))
+        assert (system.tail is not None) == has_tail
+        assert ("molecules touch beyond the cutoff" in " ".join(system.left_out)) != has_tail
+    with pytest.raises(SceneError, match="tail_correction needs a cutoff beyond the contact"):
+        build(small_scene({"argon": 100}, 18.0, forces={"cutoff_A": 3.0, "tail_correction": True}))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ({"start.euler_angles_deg": [0.0, 0.52, 0.0]}, "are these radians? They would be [0, 29.79, 0]°"),
+        ({"start.euler_angles_deg": [1.5708, 0.7854, 0.0]}, "are these radians? They would be [90, 45, 0]°"),
+        ({"gravity.acceleration_m_s2": [0.0, 0.0, 9.81]}, "points up, along +z"),
+        ({"run.timestep_s": 0.05, "run.integrator": "velocity_verlet"}, "timestep_s = 0.05 is inaccurate"),
+    ],
+)
+def test_a_body_in_another_unit(override, words, capsys):
+    words_of = [word for key, value in override.items() for word in ("--set", f"{key}={value}")]
+    assert main(["check", str(ROOT / "systems" / "heavy_top_3.toml"), *words_of]) == 0
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("angles", [[0.0, 0.1, 0.0], [0.0, 3.0, 1.0], [0.0, 59.16, 90.0]])
+def test_small_angles_are_not_suspected(angles, capsys):
+    top = ROOT / "systems" / "heavy_top_3.toml"
+    assert main(["check", str(top), "--set", f"start.euler_angles_deg={angles}"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (10, "timestep_fs = 10 is inaccurate for spce at 300 K"),
+        (0.002, "times shorter than velocity_verlet needs for spce, 11.7 fs: is it in ps?"),
+        (2, ""),
+        (0.1, ""),
+    ],
+)
+def test_check_warns_of_steps_by_their_accuracy(step, words, tmp_path, capsys):
+    (tmp_path / "s.toml").write_text(GOOD.replace("timestep_fs = 1", f"timestep_fs = {step}"))
+    assert main(["check", str(tmp_path / "s.toml")]) == 0
+    told = capsys.readouterr().err
+    assert words in told if words else told == ""
+
+
+def test_a_run_repeats_the_warnings_of_check(tmp_path):
+    stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.004}]
+    site = ARGON | {"mass_u": 4.0}
+    scene = of_sites(site, count=20, edge=25.0, stages=stages)
+    told = []
+    results = rigidmd.Simulation(scene, warn=told.append).run()
+    [expected] = [warning for warning in build(scene).warnings]
+    assert expected in told and expected in results.summary["notes"]
+    assert np.isfinite(results["potential"]).all()
