@@ -304,6 +304,9 @@ def _symmetry(path: Path, block: Block, cell: np.ndarray) -> tuple[np.ndarray, l
     """
     statements = [*_listed(path, block), *_tabulated(block)]
     if not statements:
+        if stated := block.first(*HALL, *NAMES, *NUMBERS):
+            message = f"its space group {stated} is unknown: give its operations ({OPERATIONS[0]})"
+            raise structure_error(path, message)
         is_crystal = "_atom_site_fract_x" in block
         note = "no symmetry operations in the file: its atoms were taken as all atoms of the unit cell"
         return IDENTITY, [note] if is_crystal else []

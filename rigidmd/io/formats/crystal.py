@@ -71,12 +71,12 @@ def parse_operation(text: str) -> "gemmi.Op":
 
 
 def is_group(operations: np.ndarray) -> bool:
-    """Whether the product of any two operations is one of them."""
+    """Whether the products of any two operations are these operations."""
     w, t = operations[:, :, :3] // WHOLE, operations[:, :, 3]
     rotation = WHOLE * np.einsum("aij,bjk->abik", w, w)
     translation = (np.einsum("aij,bj->abi", w, t) + t[:, None]) % WHOLE
-    products = np.concatenate([rotation, translation[..., None]], axis=3).reshape(-1, 12)
-    return len(np.unique(products, axis=0)) == len(operations)
+    products = np.concatenate([rotation, translation[..., None]], axis=3).reshape(-1, 3, 4)
+    return np.array_equal(np.unique(products, axis=0), operations)
 
 
 def keep_cell(operations: np.ndarray, cell: np.ndarray) -> bool:
