@@ -161,3 +161,15 @@ def test_what_gromacs_cannot_do_is_told_at_once(tmp_path):
     with pytest.raises(SceneError, match=r"GROMACS: .*no box or no cutoff"):
         export(free, "gromacs", tmp_path / "there")
     assert not list(tmp_path.iterdir())
+
+
+@needs_gmx
+@pytest.mark.parametrize("truncation", ["plain", "shift", "force_switch"])
+@pytest.mark.parametrize(("counts", "error"), [({"argon": 300}, 1e-5), ({"argon": 200, "krypton": 100}, 3e-4)])
+def test_the_tail_correction_of_points_is_that_of_gromacs(counts, error, truncation, tmp_path):
+    """A molecule is not among its own neighbours. GROMACS has a mean C6 over pairs of different atoms of a mixture."""
+    forces = {"cutoff_A": 9.0, "truncation": truncation, "tail_correction": True, "electrostatics": "none"}
+    system = build(small_scene(counts, 22.5, forces=forces, stages=STAGES))
+    write_gromacs(tmp_path, force_field_of(system), system.state)
+    expected = system.tail.energy(system.space.volume) / KJ_PER_MOL
+    assert energies(tmp_path)["Disper. corr."] == pytest.approx(expected, rel=error)

@@ -639,3 +639,21 @@ def test_compiling_is_not_minimising(monkeypatch):
     Simulation(small_scene({"argon": 20}, 20.0, stages=stages, precision="mixed"), warn=str).run()
     assert order.count("minimise") == 2
     assert "forces in float64" in order[: order.index("minimise")]
+
+
+@pytest.mark.parametrize("field", [5.3, 8.0])
+def test_molecules_in_a_uniform_field_alone_have_torques_and_no_forces(field):
+    """They rotate until the first step is short enough; ions in a field too strong for the step are not badly packed."""
+    sections = {"forces": {"lennard_jones": False, "electrostatics": "none"}, "start": {"temperature_K": 300.0}}
+    sections |= {
+        "fields": {"electric_V_per_nm": [0.0, 0.0, field]},
+        "stages": [{"duration_ps": 0.5, "timestep_fs": 6.25}],
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        removal = Simulation(small_scene({"spce": 30}, None, **sections), warn=str).start()
+    assert removal.steps > 0
+    assert removal.excess <= 1
+    sections["stages"] = [{"duration_ps": 5.0, "timestep_fs": 500.0}]
+    with pytest.raises(SceneError, match=r"timestep_fs of the first stage is too long for electric"):
+        Simulation(small_scene({"na_spce": 3}, None, **sections), warn=str).start()
