@@ -257,8 +257,8 @@ RINGS = [
     Mutation(
         "B20", "resume: Nose-Hoover chains and pistons start anew",
         "run/resume.py",
-        "    if exact and not are_rotations(found.rotation):",
-        "    found.extra_variables[:] = 0.0\n    if exact and not are_rotations(found.rotation):",
+        "    if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():",
+        "    found.extra_variables[:] = 0.0\n    if (np.isfinite(found.cell) != np.isfinite(like.cell)).any():",
         (
             "test_thermostat_states.py::test_a_checkpoint_gives_back_all_of_a_state",
             "test_thermostat_states.py::test_chains_go_on_to_the_same_bits_in_double_precision",
