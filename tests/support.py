@@ -283,6 +283,7 @@ HOMES = {
     "view.animation": "write_film",
     "view.body_animation": "BodyAnimation",
     "core.shipped": "CHAPTERS DOCS NOTEBOOKS find_example",
+    "analysis.mean_force": "Window potential_of_mean_force",
     "analysis.result": "Curve AnalysisResult Value converged_value",
     "analysis.runs": "Runs",
     "analysis.rigid_frames": "without_rounding fit_frames frames_of_folder",
@@ -409,6 +410,7 @@ HOMES = {
     "studies.accuracy.averages": ("AverageRun AveragedQuantity Averages UNSEEN measure_averages start_of_last_stage "),
     "studies.extrapolation": "MeanAtStep extrapolate means_of_runs",
     "studies.compare": "compare describe_run_comparison",
+    "studies.gamma_point": "periodic_basis",
     "studies.accuracy.accuracy": "measure_accuracy trial_table write_accuracy",
     "studies.stability.report": "run_cases selected_cases",
     "studies.stability.cases": (
@@ -441,6 +443,7 @@ RENAMED = {
 
 #: Whole modules, of which a test replaces something or names much: name here -> module.
 MODULES = {
+    "normal_modes": "studies.normal_modes",
     "advance": "dynamics.step_loop",
     "averages_report": "studies.accuracy.averages_report",
     "boxes": "dynamics.barostats",
@@ -448,6 +451,7 @@ MODULES = {
     "choice": "run.pilot.choice",
     "choosing": "studies.accuracy.accuracy",
     "cluster": "studies.sweep.backends",
+    "distances": "forces.fields.distances",
     "couplings": "scene.couplings",
     "integrator_rows": "scene.integrators",
     "film": "view.animation",

@@ -10,10 +10,12 @@ from rigidmd.commands.streams import progress_bar
 
 class _List(argparse.Action):
     def __call__(self, parser, *_):
+        from rigidmd.analysis import mean_force
         from rigidmd.analysis.registry import selected
 
         for entry in selected([]):
             print(f"{entry.name:18} {entry.about}")
+        print(f"{mean_force.NAME:18} {mean_force.ABOUT}, of a sweep")
         parser.exit()
 
 
@@ -37,6 +39,7 @@ class _List(argparse.Action):
     scene="this run", writes=True,
 )  # fmt: skip
 def _analyse(options: Options) -> int:
+    from rigidmd.analysis import mean_force
     from rigidmd.analysis.files import analyse_folder
     from rigidmd.analysis.registry import run_user_file
     from rigidmd.commands.sweep import print_limits
@@ -62,6 +65,10 @@ def _analyse(options: Options) -> int:
                 names = print_limits(folder, read_manifest(folder), options.extrapolate)
                 print(f"\n  files in {folder}: {', '.join(names)}")
             return FAILED if options.only and any(of.failed for of in found) else 0
+        if mean_force.NAME in options.only:
+            raise OutputError(
+                f"pmf needs a sweep over the distance of a restraint, and {folder} is the folder of a run"
+            )
         if options.extrapolate is not None:
             raise OutputError(f"--extrapolate needs a sweep over a time step, and {folder} is the folder of a run")
         done = analyse_folder(folder, *request, progress, options.figures)

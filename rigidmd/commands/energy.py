@@ -45,6 +45,10 @@ def _print_molecules(name: str, found: dict[str, Any], unit: str) -> None:
         print(f"  {note}")
     rows = [(term.replace("_", " "), value, unit) for term, value in found["components"].items()]
     rows += [(key, found[key], unit) for key in ("potential", "kinetic", "virial")]
+    if (lattice_energy := found["lattice_energy_per_molecule"]) is None:
+        rows += [("per molecule", found["potential_per_molecule"], f"{unit}, potential")]
+    else:
+        rows += [("lattice energy", lattice_energy, f"{unit} per molecule")]
     rows += [] if found["pressure_bar"] is None else [("pressure", found["pressure_bar"], "bar")]
     where = f"{unit}/Å on molecule {found['largest_force_molecule']}"
     _print_rows([*rows, ("largest force", found["largest_force_per_A"], where)], ">22.10g")

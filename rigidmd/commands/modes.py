@@ -1,6 +1,6 @@
 """`rigidmd modes`."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -22,6 +22,8 @@ ROWS = 8
     argument("--no-minimise", action="store_true", help="require that the start is a minimum"),
     argument("--count", type=COUNT, metavar="N",
         help="only the N lowest and N highest modes, by Lanczos (default: all, or 20 if there are more than 6000)"),
+    argument("--gamma", action="store_true",
+        help="only the modes at the Gamma point of the unit cell that structure.repeat repeats"),
     argument("--animate", type=COUNT, metavar="K", help="also write mode K as a run, for `view` and `film`"),
     *output_folder("runs/NAME-modes"), writes=True,
 )  # fmt: skip
@@ -33,25 +35,41 @@ def _modes(options: Options) -> int:
 
     def write(folder: Path, found: "NormalModes", command: str) -> list[Path]:
         found.table().write(folder / FILE)
-        if options.animate:
-            write_animation(folder, found, options.animate)
+        if not options.animate or not found.is_vibration(options.animate):
+            return [folder / FILE]
+        write_animation(folder, found, options.animate)
         return [folder / name for name in names]
 
-    write_study(
-        Path(options.output or f"runs/{scene.name}-modes"), options.force, names, "minimising",
-        lambda progress: normal_modes(scene, minimise=not options.no_minimise, count=options.count, progress=progress),
-        lambda found: [*_describe(found), f"  {perf_counter() - begin:.3g} s"], write,
-    )  # fmt: skip
+    def compute(progress: Callable[[float], object]) -> "NormalModes":
+        return normal_modes(
+            scene,
+            minimise=not options.no_minimise,
+            count=options.count,
+            gamma=options.gamma,
+            required=options.animate,
+            progress=progress,
+        )
+
+    def describe(found: "NormalModes") -> Iterator[str]:
+        yield from _describe(found)
+        if options.animate and not found.is_vibration(options.animate):
+            yield f"  mode {options.animate} is a zero mode, which has no animation"
+        yield f"  {perf_counter() - begin:.3g} s"
+
+    folder = Path(options.output or f"runs/{scene.name}-modes")
+    write_study(folder, options.force, names, "minimising", compute, lambda found: list(describe(found)), write)
     return 0
 
 
 def _describe(found: "NormalModes") -> Iterator[str]:
-    table, at, total, last = found.table(), found.wavenumber, len(found.coordinates.index), len(found.rate) - 1
-    unstable, warm, is_whole = at[found.rate < 0], found.temperature, len(at) == total
+    table, at, total, last = found.table(), found.wavenumber, found.total, len(found.rate) - 1
+    unstable, warm, is_whole = at[found.rate < 0], found.temperature, len(at) == len(found.coordinates.index)
     point = "a saddle point" if len(unstable) else "a minimum"
     yield f"{found.system.scene.name}: normal modes at {point} of the energy, {found.energy:.8g} kJ/mol"
     why = f" ({found.ended})" if found.ended else ""
     yield f"  largest force {found.force:.1e} kJ/(mol Å), largest torque {found.torque:.1e} kJ/mol{why}"
+    if found.cells:
+        yield f"  modes at the Gamma point: equal displacements in all {found.cells} unit cells, intensities of one"
     yield f"  {len(at)} of {total} modes: {(found.rate == 0).sum()} zero modes, {len(unstable)} unstable modes"
     if len(unstable):
         yield f"  unstable: {', '.join(f'{x:.4g}' for x in unstable)} cm⁻¹; displace the molecules and repeat"

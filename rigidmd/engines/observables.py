@@ -112,7 +112,10 @@ def observe(
         alpha=alpha, beta=beta, gamma=gamma, heat=float(ledger[HEAT]), work=float(ledger[WORK]), pressure_xx=xx,
         pressure_yy=yy, pressure_zz=zz, pressure_xy=xy, pressure_xz=xz, pressure_yz=yz, conserved=conserved,
         stage=stage or 0,
-        user_energies=(*(components[name] / energy_unit for name in system.user_terms), *trajectories),
+        user_energies=(
+            *(components[name] / energy_unit for name in system.user_terms),
+            *(term.distance_in(state) for term in system.distances.values()), *trajectories,
+        ),
     )  # fmt: skip
     return Observation(
         sample, {name: energy / energy_unit for name, energy in components.items()}, translation / energy_unit,

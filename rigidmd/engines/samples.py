@@ -3,6 +3,7 @@
 One table serves files, displays and documentation. For molecules it is the record `Sample`: each field has a `Column`.
 """
 
+import re
 from abc import ABC, abstractmethod
 from array import array
 from bisect import bisect_right
@@ -63,7 +64,7 @@ class Sample(NamedTuple):
     pressure_yz: Annotated[float, Column("Pressure yz (bar)", "bar", "the same, yz")]
     conserved: Annotated[float, Column("", "kJ/mol", "energy less heat, work and the energy of removed momentum")]
     stage: Annotated[int, Column("", "1", "index of the stage, from 0")]
-    user_energies: tuple[float, ...] = ()  # energies of the user-defined forces, kJ/mol; then OF_TRAJECTORIES
+    user_energies: tuple[float, ...] = ()  # of user-defined forces, kJ/mol; then distances, Å, and OF_TRAJECTORIES
 
 
 _HINTS = get_type_hints(Sample, include_extras=True)
@@ -86,10 +87,20 @@ OF_TRAJECTORIES = {
 IN_LOGS = COLUMNS | OF_TRAJECTORIES
 
 
+DISTANCE = re.compile(r"distance_(\d+)")
+
+
+def distance_column(k: int) -> tuple[str, Column]:
+    """Name and column of the distance that fields.restraints.k restrains."""
+    about = f"distance of the groups of fields.restraints.{k}"
+    return f"distance_{k}", Column(f"Distance {k} (A)", "Å", about)
+
+
 def more_columns(names: Sequence[str]) -> dict[str, Column]:
-    """The columns of user-defined forces and of the trajectories of hybrid Monte Carlo."""
+    """The columns of user-defined forces, of restrained distances and of the trajectories of hybrid Monte Carlo."""
     energy = lambda name: Column(f"{name} (kJ/mole)", "kJ/mol", f"energy of the force {name}")  # noqa: E731
-    return {name: OF_TRAJECTORIES.get(name) or energy(name) for name in names}
+    distances = dict(distance_column(int(found[1])) for name in names if (found := DISTANCE.fullmatch(name)))
+    return {name: (OF_TRAJECTORIES | distances).get(name) or energy(name) for name in names}
 
 
 NUMBERS = [name for name in COLUMNS if name != "stage_name"]

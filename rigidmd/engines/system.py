@@ -13,6 +13,7 @@ from rigidmd.core.state_file import SavedState, array_errors
 from rigidmd.dynamics.model import DegreesOfFreedom, Model, mobile
 from rigidmd.engines.cpu.engine import CpuEngine, Precision
 from rigidmd.engines.samples import OF_TRAJECTORIES
+from rigidmd.forces.fields.distances import DistanceRestraint
 from rigidmd.forces.neighbors.pair_loop import PairForces
 from rigidmd.forces.neighbors.space import Space, space_of, wrap
 from rigidmd.forces.parts import Tail, gather_per_molecule
@@ -108,9 +109,19 @@ class System:
         return [name for name, term in self.terms.items() if getattr(term, "tied_to_places", False)]
 
     @property
+    def distances(self) -> dict[str, DistanceRestraint]:
+        """The terms that restrain distances, by name."""
+        return {name: term for name, term in self.terms.items() if isinstance(term, DistanceRestraint)}
+
+    @property
     def more_columns(self) -> tuple[str, ...]:
         """The columns of this scene that not all scenes have."""
-        return *self.user_terms, *(OF_TRAJECTORIES if any(stage.is_hybrid for stage in self.scene.stages) else ())
+        distances = (name.replace("restraints", "distance") for name in self.distances)
+        return (
+            *self.user_terms,
+            *distances,
+            *(OF_TRAJECTORIES if any(stage.is_hybrid for stage in self.scene.stages) else ()),
+        )
 
     @property
     def removes_momentum_every(self) -> float | None:

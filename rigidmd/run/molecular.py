@@ -82,6 +82,8 @@ def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) ->
     state.energy_ledger[WORK] += observe(system, engine, state, energy_unit=1.0).potential - before
 
 
+#: Extensions of structure files that always have crystals.
+CRYSTALS = (".cif", ".mmcif")
 #: States between the last good one and a failure that are searched for its cause.
 REPLAYED = 20
 
@@ -470,6 +472,17 @@ class MolecularRun(RunPart):
             f"{system.last_freedom.total} degrees of freedom; {self.threads} threads{more}"
         )
 
+    @property
+    def _is_crystal(self) -> bool:
+        """Whether the start is a crystal whose energy is that of its molecules among each other: it is from a CIF or a
+        repeated cell, without fields and user-defined forces."""
+        scene, structure = self.scene, self.scene.structure
+        if structure is None or not scene.box.periodic or scene.fields.entries or self.system.user_terms:
+            return False
+        if any(entry.frozen for entry in scene.molecules):  # which do not interact with each other
+            return False
+        return structure.file.lower().endswith(CRYSTALS) or structure.repeat != (1, 1, 1)
+
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
         """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².
 
@@ -481,15 +494,23 @@ class MolecularRun(RunPart):
         moving = [k for k, stage in enumerate(self.scene.stages) if not stage.is_minimisation]
         seen = observe(self.system, self._engine_of(moving[0] if moving else 0), self.state, energy_unit=1.0)
         forces = np.linalg.norm(seen.load.force, axis=1)
+        n, meaning = len(self.system.model.species), describe_quantities(self.system)
+        lattice_energy = seen.potential / size / n if self._is_crystal else None
+        if lattice_energy is not None:
+            meaning["lattice_energy"] = (
+                "the potential energy per molecule at the positions of the structure file, relative to the same rigid "
+                "molecules far from each other; static: without zero-point and thermal energy"
+            )
         found = {
-            "unit": unit, "molecules": len(self.system.model.species), "relief_steps": removal.steps if removal else 0,
+            "unit": unit, "molecules": n, "relief_steps": removal.steps if removal else 0,
             "notes": [*self.system.notes, *self.system.warnings],
             "components": {name: energy / size for name, energy in seen.components.items()},
-            "potential": seen.potential / size, "kinetic": seen.kinetic / size,
+            "potential": seen.potential / size, "potential_per_molecule": seen.potential / size / n,
+            "lattice_energy_per_molecule": lattice_energy, "kinetic": seen.kinetic / size,
             "virial": float(seen.virial.trace()) / size, "virial_tensor": (seen.virial / size).tolist(),
             "pressure_bar": None if np.isnan(seen.pressure_bar) else seen.pressure_bar,
             "largest_force_per_A": float(forces.max()) / size, "largest_force_molecule": int(forces.argmax()) + 1,
-            "meaning": describe_quantities(self.system),
+            "meaning": meaning,
         }  # fmt: skip
         if measure_accuracy:
             found["accuracy"] = coulomb_errors(self.system, self.state, size)

@@ -96,18 +96,20 @@ def read_record(folder: Path) -> Record:
         columns = _motion(folder, system, missing)
     else:
         system = build(scene, user_code=False)
-        columns = _log(folder, scene.stages)
+        columns = _log(folder, scene)
     if not columns or len(next(iter(columns.values()))) == 0:
         raise OutputError(f"{folder}: the run has not written samples yet; {resume}")
     return Record(folder, scene, system, summary and summary.model_dump(exclude_unset=True), columns, missing)
 
 
-def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
+def _log(folder: Path, scene: MolecularScene) -> dict[str, np.ndarray]:
     """Columns of log.csv by the names of `results[...]`, with the index of the stage."""
     read = read_columns(folder / LOG)
     if read is None:
         raise OutputError(f"{folder / LOG} cannot be read: there is no such file")
-    headers = {HEADERS[header]: header for header in read.cells if header in HEADERS}
+    distances = dict(samples.distance_column(k) for k in range(len(scene.fields.restraints)))
+    known = HEADERS | {column.header: name for name, column in distances.items()}
+    headers = {known[header]: header for header in read.cells if header in known}
     if lacking := [name for name in ("step", "time", "stage_name") if name not in headers]:
         header = samples.COLUMNS[lacking[0]].header
         raise OutputError(f"{read.path} is not a log of rigidmd: it has no column {header!r}")
@@ -115,7 +117,7 @@ def _log(folder: Path, stages: Sequence[Stage]) -> dict[str, np.ndarray]:
         name: np.array(read.cells[header]) if name == "stage_name" else read.numbers(header, finite=name == "time")
         for name, header in headers.items()
     }
-    return found | {"stage": _stage_of(found["stage_name"], found["time"], stages)}
+    return found | {"stage": _stage_of(found["stage_name"], found["time"], scene.stages)}
 
 
 def _stage_of(names: np.ndarray, time: np.ndarray, stages: Sequence[Stage]) -> np.ndarray:

@@ -67,15 +67,25 @@ class Walls(Section):
         return AXES.index(self.axis)
 
 
+#: A molecule, or a group of molecules, by their numbers in the scene.
+Group = Annotated[int, Strict(), Field(ge=1)] | Numbers
+
+
 class Restraint(Section):
-    """Springs between centres of mass and their positions at the start, or one given position."""
+    """Springs between centres of mass and their positions at the start or one given position; or, with `between`, a
+    spring on the distance of two molecules or groups."""
 
     species: str | None = None
     """Species that is restrained; required if there are several"""
     molecules: Numbers | None = None
     """Numbers of the restrained molecules, [1, 2, 5] or "1-10, 15", as for `frozen`; default: all"""
+    between: tuple[Group, Group] | None = None
+    """Two molecules, or groups of them, whose distance is restrained: [1, 2], [[1, 2], "3-5"]. The numbers count all
+    molecules of the scene from 1 on. The distance is between the centres of mass, to the nearest periodic image"""
+    distance_A: Positive | None = None
+    """With between: the distance at which the spring has no energy"""
     stiffness_kJ_mol_A2: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
-    """Stiffness; three numbers for x, y, z"""
+    """Stiffness; three numbers for x, y, z; with between one number"""
     position_A: Vector | None = None
     """Position to which all are restrained; default: the position of each at the start"""
 
@@ -85,6 +95,27 @@ class Restraint(Section):
         if not any(stiffness if isinstance(stiffness, tuple) else (stiffness,)):
             raise ValueError("is 0: it would do nothing; leave the restraint out")
         return stiffness
+
+    def _errors(self):
+        if self.between is None:
+            if self.distance_A is not None:
+                yield "distance_A would do nothing without between = [1, 2]"
+            return
+        if self.distance_A is None:
+            yield "between needs distance_A, at which the spring has no energy"
+        if isinstance(self.stiffness_kJ_mol_A2, tuple):
+            yield "stiffness_kJ_mol_A2 has one number for a distance"
+        if given := [key for key in ("species", "molecules", "position_A") if getattr(self, key) is not None]:
+            yield f"{', '.join(given)} would do nothing with between, which names the molecules"
+
+    @property
+    def groups(self) -> tuple[list[int], ...]:
+        """The numbers of the molecules of both groups; empty without `between`."""
+        found = []
+        for group in self.between or ():
+            ranges = [(group, group)] if isinstance(group, int) else spans(group)
+            found.append([number for first, last in ranges for number in range(first, last + 1)])
+        return tuple(found)
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -166,9 +197,18 @@ def _walls_sentence(walls: Walls, term: Any) -> str:
 
 
 def _restraint_sentence(entry: Restraint, term: Any) -> str:
+    if entry.between is not None:
+        one, other = (_numbers(group) for group in entry.groups)
+        spring = f"restrained to {entry.distance_A:g} Å, {entry.stiffness[0]:g} kJ/mol/Å²"
+        return f"distance of {one} and {other} {spring}"
     size = f"{entry.stiffness[0]:g}" if len(set(entry.stiffness)) == 1 else _vector(entry.stiffness)
     where = "to their starting positions" if entry.position_A is None else f"to {_vector(entry.position_A)} Å"
     return f"{len(term.molecule)} molecules restrained {where}, {size} kJ/mol/Å²"
+
+
+def _numbers(group: list[int]) -> str:
+    """A group of molecules in words."""
+    return f"molecule {group[0]}" if len(group) == 1 else f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 
 def _vector(values: Any) -> str:
@@ -197,7 +237,9 @@ def field_notes(scene: "MolecularScene") -> list[str]:
 def field_errors(scene: "MolecularScene") -> Iterator[str]:
     """Messages on fields of a scene that contradict its other tables."""
     fields, boxed = scene.fields, scene.box.periodic
-    held = bool(fields.restraints) or any(species.frozen for species in scene.molecules)
+    held = any(entry.between is None for entry in fields.restraints) or any(
+        species.frozen for species in scene.molecules
+    )
     for k, walls in enumerate(fields.walls):
         if boxed and inf in map(abs, walls.positions_A):
             why = "or molecules would cross the periodic boundary to the other side"

@@ -280,7 +280,9 @@ class MolecularScene(Scene):
             "box.periodic is false": not self.box.periodic,
             "frozen molecules do not move: release them, or keep the volume": any(m.frozen for m in self.molecules),
             "fields.walls do not move: keep the volume": self.fields.walls,
-            "fields.restraints fix positions: keep the volume": self.fields.restraints,
+            "fields.restraints fix positions: keep the volume": any(
+                entry.between is None for entry in self.fields.restraints
+            ),
         }
         if (slab := self.forces.ewald_slab) is not None:
             rigid = {"lateral"} if slab == "z" else set()

@@ -7,7 +7,7 @@ the compiled forces and torques, in double precision. The guide `normal_modes` h
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import pi
+from math import pi, prod
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from rigidmd.run.minimise import minimise as find_minimum
 from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
 from rigidmd.scene.stage import Stage
+from rigidmd.studies.gamma_point import cells_of, periodic_basis
 from rigidmd.units import AVOGADRO, BOLTZMANN, COULOMB, FEMTOSECOND, KJ_PER_MOL
 
 #: Displacement of a difference, in smallest diameters: its error and that of rounding are 1e-10 of the largest entry.
@@ -60,12 +61,16 @@ INTENSITY = pi * AVOGADRO / 3 * COULOMB * 1e-9 / 299792458**2
 class Coordinates:
     """The mass-weighted coordinates q (d,) about a state. Frozen molecules and axes without inertia have none.
 
+    The order is: shifts sqrt(m) X along x, y, z of molecule 1, of molecule 2, ...; then rotations sqrt(I_k) theta_k
+    about the principal axes 1, 2, 3 of molecule 1, of molecule 2, ...; those that do not move are left out.
+
     scale : (d,) length of a move of `Enthalpy`, Å, for a unit of q
-    index : (d,) of each coordinate among the components of such a move: shifts (3 n), then rotations
+    index : (d,) of each coordinate among all shifts (3 n) and then all rotations (3 n)
     translations : (t, d) unit vectors of uniform translations along which the total momentum is conserved
     """
 
     def __init__(self, system: System, state: State):
+        self.system = system
         self.enthalpy, self.state = Enthalpy(system, Stage(ensemble="minimise"), state), state
         model, species = system.model, system.model.species
         rotations = np.sqrt(model.inverse_inertia[species[: len(state.rotation)]]) * self.enthalpy.arm
@@ -113,16 +118,18 @@ class NormalModes:
     rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
     wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
     error: np.ndarray  # (k,) cm⁻¹, by the asymmetry of the Hessian or the residual of the vector; NaN of zero modes
-    vector: np.ndarray  # (k, d) unit vectors in the mass-weighted coordinates
+    vector: np.ndarray  # (k, d) unit vectors, rows; columns are the mass-weighted coordinates of `Coordinates`
     translation: np.ndarray  # (k,) fraction of the kinetic energy that is of translation, not of libration
     weight: np.ndarray  # (k, n) fraction of the kinetic energy in each molecule
-    intensity: np.ndarray  # (k,) infrared, km/mol, from the derivative of the dipole of the charges
+    intensity: np.ndarray  # (k,) infrared, km/mol (of a unit cell at the Gamma point), by the dipole of the charges
+    total: int  # number of all modes; at the Gamma point those of a unit cell
+    cells: int = 0  # number of unit cells, if these are modes at the Gamma point
 
     def free_energy(self, temperature: float, quantum: bool = True) -> float:
         """Helmholtz energy (kJ/mol) of the vibrations of the rigid molecules, from the energy of the minimum on, at a
         temperature (K); at 0 the zero-point energy. Raises ValueError if there are only some of the modes."""
         if len(self.rate) < len(self.coordinates.index):
-            raise ValueError("a sum over all modes needs all of them: leave out count")
+            raise ValueError("a sum over all modes needs all of them: leave out count and gamma")
         quanta, thermal = HBAR * self.rate[self.rate > 0], BOLTZMANN * temperature
         with np.errstate(divide="ignore"):
             x = quanta / thermal
@@ -131,6 +138,10 @@ class NormalModes:
 
     def kind(self, k: int) -> str:
         return "zero" if self.rate[k] == 0 else "translation" if self.translation[k] >= 0.5 else "libration"
+
+    def is_vibration(self, number: int) -> bool:
+        """Whether the mode of this number was computed and is no zero mode."""
+        return bool(self.rate[self.number == number].any())
 
     def table(self) -> Table:
         """The modes with their properties; zero modes, which mix freely, have none."""
@@ -151,9 +162,14 @@ class NormalModes:
 
 
 def normal_modes(
-    scene: MolecularScene | BodyScene | Simulation, *, minimise: bool = True, count: int | None = None,
+    scene: MolecularScene | BodyScene | Simulation,
+    *,
+    minimise: bool = True,
+    count: int | None = None,
+    gamma: bool = False,
+    required: int | None = None,
     progress: Callable[[float], object] = lambda fraction: None,
-) -> NormalModes:  # fmt: skip
+) -> NormalModes:
     """Normal modes about the minimum next to the start of a scene, or next to the present state of a simulation.
 
     modes = rigidmd.normal_modes(rigidmd.Scene.read("water_dimer.toml"))
@@ -161,24 +177,34 @@ def normal_modes(
 
     A minimisation comes first, to the rounding of forces and torques and at constant cell.
 
-    minimise : False requires that the start is a minimum; count : of the lowest and of the highest modes, by Lanczos
-    (default: all, or 20 if there are more than 6000); progress : called with the fraction done
-    Raises SceneError for a single body, SimulationError where a minimum is required and not found.
+    minimise : False requires that the start is a minimum
+    count : of the lowest and of the highest modes, by Lanczos; default: all, or 20 if there are more than 6000
+    gamma : only modes with the period of the unit cell that `structure.repeat` repeats (k = 0)
+    required : number of a mode that has to be computed, which is checked before computing
+    progress : called with the fraction done
+
+    Raises SceneError for a single body, for a required mode that does not exist, and at the Gamma point without a unit
+    cell; SimulationError where a minimum is required and not found.
     """
     simulation = scene if isinstance(scene, Simulation) else Simulation(scene)
     if isinstance(simulation.scene, BodyScene):
         raise SceneError(simulation.scene.source, ["normal modes are of molecules, and this is a single body"])
     state, system = (simulation.state if simulation is scene else simulation.settle()).copy(), simulation.system
+    numbers = _numbers(Coordinates(system, state), count, gamma)
+    if required is not None and required not in numbers:
+        among = (
+            f"there are {numbers[-1]} modes" if len(numbers) == numbers[-1] else f"count = {count or COUNT} omits it"
+        )
+        raise SceneError(simulation.scene.source, [f"mode {required} will not be computed: {among}"])
     sizes = _find_minimum(system, state, minimise)
-    c, charges = Coordinates(system, state), system.of_sites(lambda m: m.charges)
-    d, fixed, temperature = len(c.index), len(c.translations), simulation.scene.start.temperature_K or 0.0
-    for stage in simulation.scene.stages:
-        temperature = stage.temperatures[1] or temperature
-    count = COUNT if count is None and d > MOST_DENSE else count
-    if count is None or 2 * count + fixed >= d:
-        (square, vector, error), number = _all_modes(c, progress), np.arange(1, d + 1)
+    c, charges, cells = Coordinates(system, state), system.of_sites(lambda m: m.charges), 0
+    if gamma:
+        cells = prod(cells_of(system))
+        square, vector, error = _periodic_modes(c, periodic_basis(system, state, c.index), progress)
+    elif len(numbers) == len(c.index):
+        square, vector, error = _all_modes(c, progress)
     else:
-        (square, vector, error), number = _outer_modes(c, count), np.r_[1 : count + fixed + 1, d - count + 1 : d + 1]
+        square, vector, error = _outer_modes(c, (len(numbers) - len(c.translations)) // 2)
     if not error.max() <= LARGEST_ERROR * square[-1]:
         raise SimulationError(
             f"forces are not smooth at the minimum: w² are uncertain by {error.max():.1e}/ps²; {SMOOTH}"
@@ -187,11 +213,33 @@ def normal_modes(
     rate, weight = np.nan_to_num(signed), np.zeros((len(state.position), len(square)))
     np.add.at(weight, c.index // 3 % len(weight), vector.T**2)
     slopes = np.array([c.slope(q, lambda state: charges @ system.site_positions(state)) for q in vector])
+    intensity = INTENSITY * (slopes**2).sum(axis=1) / max(cells, 1)
     return NormalModes(
-        system, c, *sizes, temperature, 2 / rate[-1] / FEMTOSECOND,
-        number, rate, PER_CM * rate, PER_CM * error / np.abs(2 * signed),
-        vector, vector**2 @ c.is_shift, weight.T, INTENSITY * (slopes**2).sum(axis=1),
+        system, c, *sizes, _last_temperature(simulation.scene), 2 / rate[-1] / FEMTOSECOND,
+        numbers, rate, PER_CM * rate, PER_CM * error / np.abs(2 * signed),
+        vector, vector**2 @ c.is_shift, weight.T, intensity, int(numbers[-1]), cells,
     )  # fmt: skip
+
+
+def _numbers(c: Coordinates, count: int | None, gamma: bool) -> np.ndarray:
+    """The numbers (k,) of the modes to compute. Raises SceneError."""
+    d, fixed, scene = len(c.index), len(c.translations), c.system.scene
+    if gamma:
+        if count is not None:
+            raise SceneError(scene.source, ["count and gamma cannot be combined: a unit cell has few modes"])
+        return np.arange(1, d // prod(cells_of(c.system)) + 1)
+    count = COUNT if count is None and d > MOST_DENSE else count
+    if count is None or 2 * count + fixed >= d:
+        return np.arange(1, d + 1)
+    return np.r_[1 : count + fixed + 1, d - count + 1 : d + 1]
+
+
+def _last_temperature(scene: MolecularScene) -> float:
+    """The temperature at the end of the last stage that sets one, K; without one the one of the start, or 0."""
+    temperature = scene.start.temperature_K or 0.0
+    for stage in scene.stages:
+        temperature = stage.temperatures[1] or temperature
+    return temperature
 
 
 def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, float, float, str]:
@@ -201,15 +249,12 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
     enthalpy, keys, ended = Enthalpy(system, loose, state), ("force_limit_kJ_mol_A", "torque_limit_kJ_mol"), ""
     if minimise:
         find_minimum(system, state, loose)
-    fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
-    if fastest is None:
-        raise SimulationError("no force holds these molecules at their positions: they have no normal modes")
-    mass = float(system.model.mass[system.model.species[enthalpy.free]].min())
-    stiff = fastest.rate**2 * mass * system.smallest_diameter / KJ_PER_MOL
+    stiff = _stiffness(enthalpy, system, state)
     for fraction in (ACCEPTED, TIGHT) if minimise else ():
         tight = loose.model_copy(update=dict.fromkeys(keys, fraction * stiff))
         if ended := find_minimum(system, state, tight).ended_by:
             break
+        stiff = _stiffness(enthalpy, system, state)  # the start may have been far from the minimum
     point = enthalpy.at(state)
     force, torque = (size / KJ_PER_MOL for size in enthalpy.largest(point)[:2])
     if max(force, torque) <= ACCEPTED * stiff:
@@ -223,6 +268,18 @@ def _find_minimum(system: System, state: State, minimise: bool) -> tuple[float, 
     )
 
 
+def _stiffness(enthalpy: Enthalpy, system: System, state: State) -> float:
+    """The force, kJ/(mol Å), with which the stiffest motion opposes a displacement by the smallest diameter; at least
+    the deepest well over this diameter, as far from each other molecules hardly attract. Raises SimulationError."""
+    fastest = stiffest_mode(system, state, enthalpy.engine) if enthalpy.free.any() else None
+    if fastest is None:
+        raise SimulationError("no force holds these molecules at their positions: they have no normal modes")
+    mass = float(system.model.mass[system.model.species[enthalpy.free]].min())
+    deepest = max((float(m.epsilon.max()) for m in system.species), default=0.0)
+    diameter = system.smallest_diameter
+    return max(fastest.rate**2 * mass * diameter, deepest / diameter) / KJ_PER_MOL
+
+
 def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """w² (d,), modes (d, d) and the error of w² (d,): the asymmetry of the Hessian, or its error on a vector."""
     hessian = np.eye(len(c.index))
@@ -233,6 +290,21 @@ def _all_modes(c: Coordinates, progress: Callable[[float], object]) -> tuple[np.
     error = np.linalg.norm(hessian @ q - c.curvature(q)) / np.linalg.norm(q)
     square, vector = np.linalg.eigh((hessian + hessian.T) / 2)
     return square, vector.T, np.full(len(square), max(error, np.abs(hessian - hessian.T).max()))
+
+
+def _periodic_modes(
+    c: Coordinates, basis: np.ndarray, progress: Callable[[float], object]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same in the space of a basis (d, k), which the Hessian must not leave: what does is an error too."""
+    images = []
+    for k, unit in enumerate(basis.T):
+        images.append(c.curvature(unit))
+        progress((k + 1) / basis.shape[1])
+    image = np.array(images).T
+    hessian = basis.T @ image
+    error = max(np.abs(hessian - hessian.T).max(), np.linalg.norm(image - basis @ hessian, axis=0).max())
+    square, vector = np.linalg.eigh((hessian + hessian.T) / 2)
+    return square, (basis @ vector).T, np.full(len(square), error)
 
 
 def _outer_modes(c: Coordinates, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -267,9 +339,9 @@ def write_animation(folder: Path, found: NormalModes, number: int) -> None:
     from rigidmd.io.trajectory import open_trajectory, write_topology  # MDAnalysis is slow to import
 
     c, system, scene, output = found.coordinates, found.system, found.system.scene, found.system.scene.output
-    k = int(np.searchsorted(found.number, number))
-    if not (k < len(found.rate) and found.number[k] == number and found.rate[k]):
+    if not found.is_vibration(number):
         raise SceneError(scene.source, [f"mode {number} is not a vibration that was computed, and has no animation"])
+    k = int(np.flatnonzero(found.number == number)[0])
     period, q = 2 * pi / abs(found.rate[k]), AMPLITUDE / np.abs(c.scale * found.vector[k]).max() * found.vector[k]
     write_scene(folder, scene)
     write_topology(folder / output.topology, system, c.state, False)

@@ -6,6 +6,7 @@ import numpy as np
 
 from rigidmd.compile import implements
 from rigidmd.core.state import OK
+from rigidmd.forces.fields.distances import DistanceRestraint, distance_restraint
 from rigidmd.forces.parts import SystemParts, select_by_number
 from rigidmd.forces.terms import add_forces
 from rigidmd.units import KJ_PER_MOL
@@ -26,8 +27,10 @@ class Restraints(NamedTuple):
         return self.stiffness != 0
 
 
-def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> Restraints | None:
+def term(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> "Restraints | DistanceRestraint | None":
     """The term of one of fields.restraints."""
+    if entry.between is not None:
+        return distance_restraint(parts, entry, where, faults)
     index, names = parts.model.species, list(dict.fromkeys(m.name for m in parts.species))
     name = entry.species or names[0]
     of_species = np.array([m.name == name for m in parts.species])[index]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidmd.analysis.files import FIGURES, AnalysisOutput, analyse_frames
+from rigidmd.analysis.mean_force import NAME as MEAN_FORCE
 from rigidmd.analysis.registry import selected
 from rigidmd.analysis.result import AnalysisResult
 from rigidmd.analysis.rigid_frames import MOST_NUMBERS, RigidFrames, frames_of_folder
@@ -25,6 +26,7 @@ from rigidmd.studies.sweep.folder import (
     state_on_disk,
 )
 from rigidmd.studies.sweep.table import SweepRow, key_columns, write_analyses_figure
+from rigidmd.studies.sweep.windows import is_of_windows, mean_force_of_sweep
 
 ANALYSES = "analysis.csv"
 
@@ -60,6 +62,10 @@ def analyse_sweep(
     ready = {point.folder for point in manifest.points if state_on_disk(folder, point) == "finished"}
     if not ready:
         raise OutputError(f"{folder}: no point of this sweep has finished yet; `rigidmd sweep` continues it")
+    wants_mean_force = MEAN_FORCE in names or (not names and is_of_windows(manifest))
+    if names == [MEAN_FORCE]:
+        return [_mean_force(folder, manifest, ready, figures)]
+    names = [name for name in names if name != MEAN_FORCE]
     selected(names)
     short, found, seen = short_keys(manifest.keys), [], 0
     for values, points in manifest.combinations():
@@ -72,11 +78,24 @@ def analyse_sweep(
         show = lambda part, name, seen=seen: progress((seen + part) / len(ready), name)  # noqa: E731
         found.append(_combine(folder, where, title, values, finished, request, show))
         seen += len(finished)
+    if wants_mean_force:
+        found.append(_mean_force(folder, manifest, ready, figures))
     if not any(combination.results for combination in found):
         reasons = dict.fromkeys(reason for combination in found for reason in combination.failed.values())
         raise OutputError(f"{folder}: no point can be analysed: {'; '.join(reasons)}")
-    _write_table(folder, manifest, found)
+    _write_table(folder, manifest, [combination for combination in found if combination.title != WINDOWS])
     return found
+
+
+#: Title of the combination of all windows of a restrained distance.
+WINDOWS = "all windows"
+
+
+def _mean_force(folder: Path, manifest: Manifest, ready: set[str], figures: str) -> Combination:
+    """The potential of mean force of all windows, as the combination of all points."""
+    points = [point for point in manifest.points if point.folder in ready]
+    result, files = mean_force_of_sweep(folder, manifest, points, figures)
+    return Combination(WINDOWS, {}, len(points), [result], {}, files)
 
 
 class _Request(NamedTuple):

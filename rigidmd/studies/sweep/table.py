@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
-from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
+from rigidmd.engines.samples import BODY_COLUMNS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.folder import add_to_folder
@@ -165,6 +165,7 @@ def summarise_run(record: Record) -> dict[str, Measured]:
 def _means_of(record: Record, production: np.ndarray) -> dict[str, Measured]:
     """Means of the columns of the log over some samples. A constant has no error."""
     found: dict[str, Measured] = {}
+    described = record.log.described
     for name, values in record.columns.items():
         if name in NOT_AVERAGED:
             continue
@@ -173,7 +174,7 @@ def _means_of(record: Record, production: np.ndarray) -> dict[str, Measured]:
             continue
         if np.ptp(values[production]) == 0:
             average, error = float(values[production][0]), None
-        found[IN_LOGS[name].header] = average, error
+        found[described[name].header] = average, error
         if name == "potential":
             n = len(record.system.model.species)
             found[POTENTIAL] = average / n, None if error is None else error / n

@@ -1,0 +1,143 @@
+"""A harmonic restraint of the distance between two molecules, or between the centres of mass of two groups of them."""
+
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidmd.compile import implements, kernel
+from rigidmd.core.state import OK, State
+from rigidmd.forces.parts import SystemParts
+from rigidmd.forces.terms import add_forces
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+#: A distance of half the box, where the force jumps, has to cost this many kT at least.
+LEAST_BARRIER = 15.0
+
+
+class DistanceRestraint(NamedTuple):
+    """U = stiffness/2 (r - distance)², with r from the centre of one group to the nearest image of that of the other.
+
+    The members of a group are taken at the images nearest to its first molecule. The force on a group acts on its
+    members by their fractions of its mass, so that there is no torque, and the total momentum does not change.
+    """
+
+    first: np.ndarray  # (a,) int64, molecules of a group
+    second: np.ndarray  # (b,)
+    first_fraction: np.ndarray  # (a,) of the mass of the group
+    second_fraction: np.ndarray  # (b,)
+    distance: float  # Å
+    stiffness: float  # u/ps²
+
+    def distance_in(self, state: State) -> float:
+        """The distance r of the groups in a state, Å."""
+        start, end = (
+            _centre_in(state, *group)
+            for group in ((self.first, self.first_fraction), (self.second, self.second_fraction))
+        )
+        return float(np.linalg.norm(nearest_images(end - start, state.cell)))
+
+
+def nearest_images(vectors: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) to nearest images in a cell (3, 3), exact up to half its smallest height; unchanged if its edges
+    are infinite."""
+    found = np.array(vectors, float)
+    if np.isfinite(cell[0, 0]):
+        for k in (2, 1, 0):
+            found -= np.rint(found[..., k, None] / cell[k, k]) * cell[k]
+    return found
+
+
+def _centre_in(state: State, members: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    origin = state.position[members[0]]
+    return origin + fraction @ nearest_images(state.position[members] - origin, state.cell)
+
+
+def distance_restraint(parts: SystemParts, entry: Any, where: str, faults: list[str]) -> DistanceRestraint | None:
+    """The term of one of fields.restraints with `between`."""
+    state, n, before = parts.state, len(parts.model.species), len(faults)
+    groups = [np.array(group) - 1 for group in entry.groups]
+    if largest := [int(group.max()) + 1 for group in groups if group.max() >= n]:
+        faults.append(f"{where}.between: there is no molecule {largest[0]}; there are 1 to {n}")
+        return None
+    if any(len(np.unique(group)) < len(group) for group in groups) or np.isin(*groups).any():
+        faults.append(f"{where}.between: a molecule is named twice")
+    if not any(parts.moves[parts.model.species[group]].any() for group in groups):
+        faults.append(f"{where} would do nothing: all its molecules are frozen")
+    mass = [parts.model.mass[parts.model.species[group]] for group in groups]
+    fractions = [of / of.sum() for of in mass]
+    found = DistanceRestraint(*groups, *fractions, entry.distance_A, entry.stiffness[0] * KJ_PER_MOL)
+    if np.isfinite(state.cell[0, 0]):
+        faults += _faults_in_box(found, parts, where)
+    return found if len(faults) == before else None
+
+
+def _faults_in_box(term: DistanceRestraint, parts: SystemParts, where: str) -> list[str]:
+    """Messages on a distance or a group that is too long for the box."""
+    cell = parts.state.cell
+    half = 0.5 / float(np.linalg.norm(np.linalg.inv(cell), axis=0).max())
+    temperatures = [parts.scene.start.temperature_K or 0.0]
+    temperatures += [value or 0.0 for stage in parts.scene.stages for value in stage.temperatures]
+    barrier = 0.5 * term.stiffness * max(0.0, half - term.distance) ** 2
+    faults = []
+    if barrier <= LEAST_BARRIER * BOLTZMANN * max(temperatures):
+        faults.append(
+            f"{where}.distance_A = {term.distance:g}: the distance may come near half the smallest height of the box, "
+            f"{half:.6g} Å, where the nearest image changes; use a larger box or a higher stiffness_kJ_mol_A2"
+        )
+    for group in (term.first, term.second):
+        arms = nearest_images(parts.state.position[group] - parts.state.position[group[0]], cell)
+        if (longest := float(np.linalg.norm(arms, axis=1).max())) > 0.5 * half:
+            faults.append(
+                f"{where}.between: molecules of a group are {longest:.3g} Å from its first one, more than a quarter of "
+                f"the smallest height of the box ({2 * half:.3g} Å): their nearest images would change"
+            )
+    return faults
+
+
+@kernel(inline=True)
+def _nearest(cell, x, y, z):
+    """A vector to the nearest image; see `nearest_images`."""
+    if np.isfinite(cell[0, 0]):
+        turns = np.rint(z / cell[2, 2])
+        x, y, z = x - turns * cell[2, 0], y - turns * cell[2, 1], z - turns * cell[2, 2]
+        turns = np.rint(y / cell[1, 1])
+        x, y = x - turns * cell[1, 0], y - turns * cell[1, 1]
+        x -= np.rint(x / cell[0, 0]) * cell[0, 0]
+    return x, y, z
+
+
+@kernel(inline=True)
+def _centre(state, members, fraction):
+    """The centre of mass of a group, its members at the images nearest to the first."""
+    first = members[0]
+    x0, y0, z0 = state.position[first, 0], state.position[first, 1], state.position[first, 2]
+    x, y, z = x0, y0, z0
+    for k in range(len(members)):
+        m = members[k]
+        dx, dy, dz = _nearest(
+            state.cell, state.position[m, 0] - x0, state.position[m, 1] - y0, state.position[m, 2] - z0
+        )
+        x, y, z = x + fraction[k] * dx, y + fraction[k] * dy, z + fraction[k] * dz
+    return x, y, z
+
+
+@implements(add_forces, DistanceRestraint)
+def _add_distance_restraint(term, state, load, tally):
+    ax, ay, az = _centre(state, term.first, term.first_fraction)
+    bx, by, bz = _centre(state, term.second, term.second_fraction)
+    arm = _nearest(state.cell, bx - ax, by - ay, bz - az)
+    r = sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
+    away = r - term.distance
+    scale = -term.stiffness * away / r if r > 0 else 0.0
+    for i in range(3):
+        for k in range(len(term.first)):
+            load.force[term.first[k], i] -= term.first_fraction[k] * scale * arm[i]
+        for k in range(len(term.second)):
+            load.force[term.second[k], i] += term.second_fraction[k] * scale * arm[i]
+        if tally is not None:
+            for j in range(3):
+                tally[1 + 3 * i + j] += scale * arm[i] * arm[j]
+    if tally is not None:
+        tally[0] += 0.5 * term.stiffness * away * away
+    return OK
