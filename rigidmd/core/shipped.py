@@ -28,7 +28,7 @@ SECTIONS = {
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
         "npt", "time_step", "ensembles", "electrostatics", "structures", "tables", "slab", "analysis", "transport",
-        "normal_modes", "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures", "ase",
+        "normal_modes", "pmf", "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures", "ase",
         "calculators", "engines", "coming_from", "extending",
     ),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
