@@ -746,7 +746,7 @@ def test_a_restrained_distance_in_a_run():
 @pytest.mark.parametrize(
     ("entry", "expected"),
     [
-        (PAIR | {"between": [1, 9]}, "between: there is no molecule 9; there are 1 to 6"),
+        (PAIR | {"between": [1, 9]}, "between: molecule 9 does not exist; there are 1 to 6"),
         (PAIR | {"between": [2, 2]}, "between: a molecule is named twice"),
         (PAIR | {"between": [[1, 2], [2, 3]]}, "between: a molecule is named twice"),
         (PAIR | {"distance_A": None}, "between needs distance_A"),

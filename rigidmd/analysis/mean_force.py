@@ -35,7 +35,7 @@ class Window(NamedTuple):
 
     @property
     def decorrelated(self) -> np.ndarray:
-        """Samples that are one statistical inefficiency apart."""
+        """Samples at intervals of the statistical inefficiency."""
         off = self.samples - self.samples.mean()
         return self.samples[:: max(1, round(inefficiency(off)))] if off.any() else self.samples[:1]
 
@@ -106,7 +106,7 @@ def _free_energies(
     def fractions(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Logarithm (n,) of the sum over windows, and the fraction (k, n) of each window in it."""
         terms = np.log(count)[:, None] + f[:, None] - bias
-        total = logsumexp(terms, axis=0)
+        total = np.asarray(logsumexp(terms, axis=0))
         return total, np.exp(terms - total)
 
     def function(free: np.ndarray) -> tuple[float, np.ndarray]:
@@ -138,7 +138,7 @@ def _profile(
     x = np.concatenate(samples)
     count = np.array([len(some) for some in samples], float)
     bias = _biases(windows, x, thermal_energy)
-    weight = -logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0)
+    weight = -np.asarray(logsumexp(np.log(count)[:, None] + free[:, None] - bias, axis=0))
     density = np.histogram(x, edges, weights=np.exp(weight - weight.max()) / x**2)[0][kept]
     with np.errstate(divide="ignore", invalid="ignore"):
         found = -thermal_energy * np.log(density)

@@ -28,8 +28,8 @@ SECTIONS = {
     "tutorials": ("top", "water", "molecule", "notebook"),
     "guides": (
         "npt", "time_step", "ensembles", "electrostatics", "structures", "tables", "slab", "analysis", "transport",
-        "normal_modes", "pmf", "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures", "ase",
-        "calculators", "engines", "coming_from", "extending",
+        "normal_modes", "pmf", "replicas", "studies", "continuing", "resume", "stops", "troubleshooting", "pictures",
+        "ase", "calculators", "engines", "coming_from", "extending",
     ),
     "theory": ("dynamics", "bodies", "interactions", "sampling", "errors", "glossary"),
     "reference": ("commands", "scene", "body", "models", "integrators", "files", "python"),

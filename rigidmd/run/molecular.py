@@ -24,6 +24,7 @@ from rigidmd.engines.samples import OF_TRAJECTORIES, Samples, equilibrated
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
 from rigidmd.io.checkpoint import Checkpoint
+from rigidmd.io.formats import format_of
 from rigidmd.io.formats.cells import cell_of
 from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
@@ -82,8 +83,6 @@ def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) ->
     state.energy_ledger[WORK] += observe(system, engine, state, energy_unit=1.0).potential - before
 
 
-#: Extensions of structure files that always have crystals.
-CRYSTALS = (".cif", ".mmcif")
 #: States between the last good one and a failure that are searched for its cause.
 REPLAYED = 20
 
@@ -474,14 +473,15 @@ class MolecularRun(RunPart):
 
     @property
     def _is_crystal(self) -> bool:
-        """Whether the start is a crystal whose energy is that of its molecules among each other: it is from a CIF or a
-        repeated cell, without fields and user-defined forces."""
+        """Whether the start is a crystal that only interactions of its molecules hold: from a CIF or a repeated cell,
+        without fields and user-defined forces."""
         scene, structure = self.scene, self.scene.structure
         if structure is None or not scene.box.periodic or scene.fields.entries or self.system.user_terms:
             return False
         if any(entry.frozen for entry in scene.molecules):  # which do not interact with each other
             return False
-        return structure.file.lower().endswith(CRYSTALS) or structure.repeat != (1, 1, 1)
+        form = format_of(structure.file)
+        return (form is not None and form.crystals) or structure.repeat != (1, 1, 1)
 
     def start_energy(self, size: float, unit: str, measure_accuracy: bool = False) -> dict:
         """Energies, virial, pressure and largest force at the start; energies in a unit of `size` u Å²/ps².

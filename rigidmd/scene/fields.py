@@ -207,7 +207,7 @@ def _restraint_sentence(entry: Restraint, term: Any) -> str:
 
 
 def _numbers(group: list[int]) -> str:
-    """A group of molecules in words."""
+    """A group of molecules, for messages."""
     return f"molecule {group[0]}" if len(group) == 1 else f"the centre of {len(group)} molecules ({group[0]}, ...)"
 
 

@@ -140,7 +140,7 @@ class NormalModes:
         return "zero" if self.rate[k] == 0 else "translation" if self.translation[k] >= 0.5 else "libration"
 
     def is_vibration(self, number: int) -> bool:
-        """Whether the mode of this number was computed and is no zero mode."""
+        """Whether the mode of this number was computed and has a frequency."""
         return bool(self.rate[self.number == number].any())
 
     def table(self) -> Table:

@@ -16,10 +16,10 @@ LEAST_BARRIER = 15.0
 
 
 class DistanceRestraint(NamedTuple):
-    """U = stiffness/2 (r - distance)², with r from the centre of one group to the nearest image of that of the other.
+    """U = stiffness/2 (r - distance)², with r from the centre of one group to the nearest image of the other centre.
 
     The members of a group are taken at the images nearest to its first molecule. The force on a group acts on its
-    members by their fractions of its mass, so that there is no torque, and the total momentum does not change.
+    members by their fractions of its mass, without torques, and the total momentum does not change.
     """
 
     first: np.ndarray  # (a,) int64, molecules of a group
@@ -58,7 +58,7 @@ def distance_restraint(parts: SystemParts, entry: Any, where: str, faults: list[
     state, n, before = parts.state, len(parts.model.species), len(faults)
     groups = [np.array(group) - 1 for group in entry.groups]
     if largest := [int(group.max()) + 1 for group in groups if group.max() >= n]:
-        faults.append(f"{where}.between: there is no molecule {largest[0]}; there are 1 to {n}")
+        faults.append(f"{where}.between: molecule {largest[0]} does not exist; there are 1 to {n}")
         return None
     if any(len(np.unique(group)) < len(group) for group in groups) or np.isin(*groups).any():
         faults.append(f"{where}.between: a molecule is named twice")

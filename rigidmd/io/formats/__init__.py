@@ -34,6 +34,7 @@ class Format(NamedTuple):
     read: Callable[..., list[Callable[[], Atoms]]] | None = None  # (path, lines)
     content: re.Pattern[str] | None = None  # recognises the begin of a text whose extension is unknown
     has_types: bool = False
+    crystals: bool = False  # every structure is the unit cell of a crystal
     # A frame of a trajectory, 1 for the first, -1 for the last; with `has_types` as `read`. If the format has no names,
     # `read_arrays` returns the position (n, 3), and velocity and cell (3, 3) if it has them, in another process: a
     # damaged file may crash it.

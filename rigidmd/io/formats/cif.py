@@ -433,6 +433,6 @@ def _formula(text: str) -> dict[str, float]:
 
 
 register(Format(
-    (".cif", ".mmcif"), read=read_cif,
+    (".cif", ".mmcif"), read=read_cif, crystals=True,
     content=re.compile(r"\A(?:[ \t]*(?:#.*)?\n)*[ \t]*data_\S", re.IGNORECASE),
 ))  # fmt: skip

@@ -11,6 +11,8 @@ from rigidmd.analysis.rigid_frames import production_samples
 from rigidmd.engines.samples import distance_column
 from rigidmd.errors import OutputError
 from rigidmd.run.record import read_record
+from rigidmd.scene import MolecularScene
+from rigidmd.scene.validation import not_none
 from rigidmd.studies.sweep.folder import SEED, Manifest, SweepPoint
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
@@ -51,7 +53,7 @@ def mean_force_of_sweep(
 def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
     """The window of a run, its temperature (K), and the samples used, as analysis.json has them."""
     record = read_record(folder)
-    if record.is_body:
+    if not isinstance(record.scene, MolecularScene):
         raise OutputError(f"{folder} is a run of a single body, which has no distances")
     stage, production = production_samples(record)
     name, column = distance_column(k)
@@ -61,7 +63,7 @@ def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:
         raise OutputError(f"{folder}: the windows need a last stage at constant temperature and volume (nvt)")
     entry, time = record.scene.fields.restraints[k], record.time[production]
     used = {"stage": stage.label, "from_ps": float(time[0]), "to_ps": float(time[-1]), "frames": len(time), "notes": []}
-    window = Window(entry.distance_A, entry.stiffness[0], record.columns[name][production])
+    window = Window(not_none(entry.distance_A), entry.stiffness[0], record.columns[name][production])
     return window, float(stage.temperatures[1]), used
 
 
