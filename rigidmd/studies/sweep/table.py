@@ -12,7 +12,7 @@ import numpy as np
 from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import earlier_production, production_samples
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
-from rigidmd.engines.samples import BODY_COLUMNS, NOT_AVERAGED
+from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
 from rigidmd.figures.style import FAINT, INK, curve_style, open_axis, panel_grid, write_figure
 from rigidmd.io.folder import add_to_folder
