@@ -121,7 +121,7 @@ def swept(folder, duration, distances):
     return rigidmd.sweep(folder / "argon.toml", points, folder / "sweep", jobs=2)
 
 
-@pytest.mark.extended
+@pytest.mark.soak
 def test_a_sweep_of_windows(tmp_path, capsys):
     swept(tmp_path, 40, [4.0, 4.8])
     assert main(["analyse", str(tmp_path / "sweep"), "--only", "pmf", "--figures", "svg"]) == 0
