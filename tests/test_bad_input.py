@@ -182,7 +182,7 @@ def test_an_interval_beyond_all_steps_is_never(key):
         ("start.gro", 'is a structure file, not a scene: a scene names it by [structure] file = "start.gro"'),
         ("start.pdb", 'a scene names it by [structure] file = "start.pdb"'),
         ("run.xtc", 'is a trajectory file, not a scene: a scene names it by [structure] file = "run.xtc"'),
-        ("start.g96", "a scene is a TOML file; one that starts from a structure names it by [structure] file"),
+        ("start.xsf", "a scene is a TOML file; one that starts from a structure names it by [structure] file"),
         ("folder", "is a folder; a scene is a file, such as "),
         ("empty", "is a folder; a scene is a TOML file"),
         ("run", "is a folder; `rigidmd resume "),

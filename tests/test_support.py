@@ -19,6 +19,7 @@ PUBLIC = {
     "rigidmd.units",
 }
 OPEN = "the assumptions about Numba and the rules of compiled code are what it tests"
+DIRECT = "a test imports what it tests from its module"
 #: Past the door: file -> the inner packages that it imports itself, why.
 PAST = {
     "support.py": (["rigidmd"], "is the door"),
@@ -32,7 +33,16 @@ PAST = {
     ),
     "test_forces.py": (["rigidmd.compile", "rigidmd.forces"], "a new pair potential as a file of the package"),
     "test_run.py": (["rigidmd.commands.arguments"], "a command in a file of its own"),
-    "test_strangers.py": (["rigidmd.core.process"], "a script in so little memory that it loads nothing else"),
+    "test_strangers.py": (
+        ["rigidmd.core.process", "rigidmd.compile", "rigidmd.scene.models"],
+        "scripts in little memory, and processes in a hostile folder, which load nothing else",
+    ),
+    "test_engine_settings.py": (["rigidmd.engines.openmm.system"], DIRECT),
+    "test_minimise.py": (["rigidmd.engines.cpu.engine", "rigidmd.run.molecular"], DIRECT),
+    "test_mixtures.py": (["rigidmd.engines.external"], DIRECT),
+    "test_notebook.py": (["rigidmd.run.loop"], DIRECT),
+    "test_plausibility.py": (["rigidmd.assemble.plausibility", "rigidmd.scene.models"], DIRECT),
+    "test_schema_walk.py": (["rigidmd.scene.base"], DIRECT),
 }
 FILES = sorted(TESTS.rglob("*.py"))
 

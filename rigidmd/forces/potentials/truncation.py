@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.polynomial import Polynomial as Polynomials
 from numpy.polynomial import chebyshev
-from scipy.integrate import quad
 
 from rigidmd.compile import chosen_by_type, is_a, kernel
 from rigidmd.compile.simd import inverse_square_root, polynomial
@@ -279,7 +278,11 @@ def integral_of_removed_energy(
         return r**2 * float(removed_energy(energy, truncation, terms, np.array([r]))[0])
 
     inside = -terms[0] * start**3 / 3
-    return inside + (quad(removed, start, truncation.cutoff)[0] if start < truncation.cutoff else 0.0)
+    if start == truncation.cutoff:
+        return inside
+    from scipy.integrate import quad  # slow to import
+
+    return inside + quad(removed, start, truncation.cutoff)[0]
 
 
 #: A cutoff this close to the minimum of an energy, as a fraction, is the rounded minimum of a repulsive potential.
