@@ -20,7 +20,7 @@ from ase.stress import full_3x3_to_voigt_6_stress, voigt_6_to_full_3x3_stress
 
 from rigidmd.assemble.assignment import massive_sites
 from rigidmd.assemble.build import build
-from rigidmd.assemble.matching import MatchedMolecules, match, refit
+from rigidmd.assemble.matching import CLEARLY_BETTER, CLOSE_FIT, MatchedMolecules, match, refit
 from rigidmd.assemble.scenes import SOURCE, atoms_errors, models_with_absolute_paths, scene_from_atoms
 from rigidmd.assemble.species import species_of
 from rigidmd.assemble.user_code.force import Force, UserForceError, real_numbers
@@ -48,6 +48,8 @@ __all__ = ["CalculatorForce", "RigidMD"]
 
 #: Largest strain of the cell for which numbers such as the grid of PME are kept.
 LARGEST_STRAIN = 0.1
+#: Atoms that are bent by this factor more than those before may be other atoms.
+JUMP = 2.0
 #: Tables of a scene that a calculator uses.
 TABLES = ("forces", "fields", "precision")
 
@@ -107,6 +109,7 @@ class RigidMD(Calculator):
         self._bend, self._tolerance = bend, tolerance
         self._warned = False
         self._assembly: _Assembly | None = None
+        self._bent = 0.0  # of the molecules seen last
         not_none(self.parameters).update(models=models, atom_forces=atom_forces, **given)
 
     def calculate(self, atoms: Atoms | None = None, properties=("energy",), system_changes=all_changes) -> None:
@@ -158,20 +161,28 @@ class RigidMD(Calculator):
         return self.__dict__ | {"_assembly": None}  # machine code cannot be pickled
 
     def _fit_atoms(self, atoms: Atoms) -> "_FittedAtoms":
-        """Rigid molecules fitted to the atoms, as matched before if this still fits."""
+        """Rigid molecules fitted to the atoms, as matched before if this still fits. If they deviate much more than
+        before, other atoms may be at the positions of these: then they are matched anew, and the better match counts,
+        so that an energy does not depend on the atoms that were seen before."""
         if faults := atoms_errors(atoms):
             raise SceneError(SOURCE, faults)
         known = self._assembly if self._assembly is not None and self._assembly.applies_to(atoms) else None
-        if known is not None and (fitted := known.fit(atoms)).bent <= self._tolerance:
-            return fitted
+        before = known.fit(atoms) if known is not None else None
+        if before is not None and before.bent <= max(JUMP * self._bent, CLOSE_FIT):
+            self._bent = before.bent
+            return before
         try:
-            self._assembly = self._assemble(atoms, {})
+            found = self._assemble(atoms, {})
         except StructureError as error:
             if known is None:
                 raise
             hint = "They matched before: keep the molecules rigid by constraints, or move them by RigidMD.minimise"
             raise StructureError(SOURCE, [*error.errors, hint]) from None
-        return self._assembly.fit(atoms)
+        fitted = found.fit(atoms)
+        if before is not None and before.bent <= min(self._tolerance, fitted.bent / CLEARLY_BETTER):
+            found, fitted = not_none(known), before
+        self._assembly, self._bent = found, fitted.bent
+        return fitted
 
     def _assemble(self, atoms: Atoms, stage_keys: Mapping[str, Any]) -> "_Assembly":
         """A system of these atoms. Raises SceneError, StructureError."""

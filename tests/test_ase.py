@@ -273,6 +273,36 @@ def test_settings_that_cannot_be_used_are_told(settings, said):
         rigidmd.scene_from_atoms(**{"atoms": molecule("H2O"), "models": ["spce"]} | settings)
 
 
+def test_energies_do_not_depend_on_the_atoms_before():
+    """Two ends of a molecule exchange places, which the earlier assignment of atoms fits within the tolerance."""
+    angle, charges = np.radians(124.0), (0.2, -0.3, 0.1)
+    x = np.array([(1.54, 0.0, 0.0), (0.0, 0.0, 0.0), (1.33 * np.cos(angle), 1.33 * np.sin(angle), 0.0)])
+    sites = [
+        {
+            "name": name,
+            "element": "C",
+            "mass_u": mass,
+            "position_A": at,
+            "charge_e": q,
+            "sigma_A": 3.7,
+            "epsilon_K": 90.0,
+        }
+        for name, mass, at, q in zip(("A", "B", "C"), (15.0, 13.0, 14.0), x.tolist(), charges, strict=True)
+    ]
+    pair = ase.Atoms("C6", [*x, *(x @ [[0, 1, 0], [0, 0, 1], [1, 0, 0]] + [0.0, 3.0, 4.5])])
+    exchanged = pair[[2, 1, 0, 5, 4, 3]]
+    calc = RigidMD([{"name": "propene", "sites": sites}])
+    energy = calc.get_potential_energy(pair)
+    forces = calc.get_forces(pair)
+    assert calc.get_potential_energy(exchanged) == pytest.approx(energy, rel=1e-9)
+    assert calc.get_forces(exchanged) == pytest.approx(forces[[2, 1, 0, 5, 4, 3]], abs=1e-9)
+    bent = pair.copy()  # continuously
+    for _ in range(4):
+        bent.positions[0, 2] += 0.02
+        calc.get_potential_energy(bent)
+    assert calc.get_potential_energy(bent) == RigidMD([{"name": "propene", "sites": sites}]).get_potential_energy(bent)
+
+
 def test_two_models_that_fit_are_not_chosen_from():
     with pytest.raises(StructureError, match="may be spce or tip3p: give them residue_names"):
         build(rigidmd.scene_from_atoms(molecule("H2O"), ["spce", "tip3p"]))

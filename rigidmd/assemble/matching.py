@@ -335,7 +335,7 @@ class _Matcher:
         error messages by molecule; `known` is the number of those found before."""
         faults = {}
         rms = np.array([np.where(g.fits, g.assigned.fit.rms, np.inf) for g in groups])  # (groups, m)
-        chosen, fitting = rms.argmin(axis=0), np.isfinite(rms)
+        chosen, fitting = rms.argmin(axis=0), np.asarray(np.isfinite(rms))
         clear = np.where(np.eye(len(groups), dtype=bool)[chosen].T, np.inf, rms).min(axis=0)
         least = rms.min(axis=0) + EQUAL_OF_RADIUS * max(g.limit for g in groups) / self._tolerance
         doubtful = (fitting.sum(axis=0) > 1) & (least >= EXACTLY * clear)
