@@ -168,7 +168,8 @@ class RigidMD(Calculator):
             raise SceneError(SOURCE, faults)
         known = self._assembly if self._assembly is not None and self._assembly.applies_to(atoms) else None
         before = known.fit(atoms) if known is not None else None
-        if before is not None and before.bent <= max(JUMP * self._bent, CLOSE_FIT):
+        usual = min(max(JUMP * self._bent, CLOSE_FIT), self._tolerance)
+        if before is not None and before.bent <= usual:
             self._bent = before.bent
             return before
         try:
