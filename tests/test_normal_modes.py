@@ -422,5 +422,5 @@ def test_the_lattice_energy_of_a_crystal(tmp_path, capsys):
     )
     assert main(["energy", str(scene)]) == 0
     printed = capsys.readouterr().out
-    assert f"lattice energy {one:22.10g} kJ/mol per molecule" in printed
+    assert f"{'lattice energy':22}{one:22.10g} kJ/mol per molecule" in printed
     assert "relative to the same rigid molecules far from each other; static" in printed
