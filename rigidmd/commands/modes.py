@@ -81,8 +81,9 @@ def _describe(found: "NormalModes") -> Iterator[str]:
     if is_whole and warm:
         quantum, classical = found.free_energy(warm), found.free_energy(warm, quantum=False)
         yield f"  free energy of the vibrations at {warm:g} K: {quantum:.6g} kJ/mol, classical {classical:.6g} kJ/mol"
-    _, kind, *_, part, _, where = table.values(last)
-    mode = f"mode {total}: {kind} of {part:.3g} molecules, largest in {where}"
-    yield f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by {mode}"
+    if not found.cells:  # of the whole crystal other modes may be faster
+        _, kind, *_, part, _, where = table.values(last)
+        mode = f"mode {total}: {kind} of {part:.3g} molecules, largest in {where}"
+        yield f"  longest stable step of velocity Verlet {found.longest_step_fs:.3g} fs, set by {mode}"
     shown = [k for k in table.rows if k < ROWS or k > last - ROWS]
     yield "\n" + table._replace(rows=shown).text()

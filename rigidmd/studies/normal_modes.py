@@ -113,7 +113,7 @@ class NormalModes:
     torque: float  # largest at the minimum, kJ/mol
     ended: str  # why the minimisation stopped before the rounding of forces, if it did
     temperature: float  # of the scene, K; 0 if it has none
-    longest_step_fs: float  # the longest stable step of velocity Verlet, 2/w of the last mode
+    longest_step_fs: float  # 2/w of the last mode; if all were computed, the longest stable step of velocity Verlet
     number: np.ndarray  # (k,) of each mode among all d, from 1
     rate: np.ndarray  # (k,) w, rad/ps; 0 of zero modes, negative of unstable modes
     wavenumber: np.ndarray  # (k,) w/(2 pi c), cm⁻¹
