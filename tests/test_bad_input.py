@@ -734,8 +734,8 @@ def test_points_from_a_file_fit_wherever_they_are(tmp_path):
 
 def test_structure_files_with_other_faults(capsys, tmp_path):
     assert "count is 200" in refused(capsys, tmp_path, structure_scene(tmp_path, WATER216, extra="count = 200\n"))
-    assert "may be spce or tip3p" in refused(
-        capsys, tmp_path, structure_scene(tmp_path, WATER216, models=("spce", "tip3p"))
+    assert "may be spce or spc:" in refused(
+        capsys, tmp_path, structure_scene(tmp_path, WATER216, models=("spce", "spc"))
     )
     two = "1\n\nAr 0 0 0\n" * 2
     assert "holds 2 structures" in refused(
