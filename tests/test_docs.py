@@ -317,6 +317,8 @@ def test_commands_in_the_text_are_commands(document):
         elif words[0] == "rigidmd" and words[1:2] != ["COMMAND"] and len(words) > 1:
             filled = [PLACEHOLDERS.get(word, word) for word in words[1:]]
             parse([word for word in filled if word][: filled.index(">") if ">" in filled else None])
+        elif words[:1] == ["python"] and words[-2:-1] == ["-m"]:
+            assert words[-1] == "rigidmd"
         elif words[:1] == ["python"] and len(words) > 1:
             assert (ROOT / words[1]).is_file(), quoted
             source = (ROOT / words[1]).read_text()
