@@ -123,7 +123,7 @@ def test_the_list_is_that_of_all(capsys):
         cli.main(["analyse", "--list"])
     assert ended.value.code == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert listed == BUILT_IN
+    assert listed == [*BUILT_IN, "pmf"]  # of a sweep
 
 
 def test_results_in_memory_and_from_the_folder_agree(water):

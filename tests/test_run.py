@@ -411,7 +411,6 @@ SCREENED = {"energy": "a*exp(-r/2)/r", "parameters": {"AR": {"a": 5.0}}}
 @pytest.mark.parametrize(
     ("counts", "cutoff", "entry", "words"),
     [
-        ({"spce": 20}, 0.9, None, "0.9 Å is shorter than 3.55 Å, where the energy of spce.OW and spce.OW .* in nm"),
         ({"spce": 20}, 3.0, None, "3 Å is shorter than 3.55 Å"),
         ({"spce": 20}, 3.54, None, ""),  # WCA, rounded
         ({"spce": 20}, 7.0, None, ""),
@@ -537,7 +536,7 @@ def test_constant_energy_after_a_thermostat_explains_its_temperature():
     assert one["set_temperature_K"] == (80.0, 100.0) and "temperature_scatter_K" not in one
     assert "temperature_scatter_K" not in three  # nothing was drawn at its start
     steady = results["temperature"][(results["stage"] == 2) & (results["time"] > two["equilibrated_from_ps"] - 1e-9)]
-    square = 2 * steady.mean() ** 2 / 117 - steady.var()
+    square = max(0.0, 2 * steady.mean() ** 2 / 117 - steady.var())
     assert two["temperature_scatter_K"] == pytest.approx(np.sqrt(square))
     assert two["temperature_before_K"] == 100.0
     text = summary_text(results.summary)
@@ -937,7 +936,6 @@ def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
     assert process.returncode == code
     assert "interrupted" in out
     assert "Traceback" not in err
-    assert "compiling" in err  # said though this is no terminal
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
     assert (folder / "final.npz").exists()
     assert frames_in(folder) >= 1

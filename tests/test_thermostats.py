@@ -268,6 +268,7 @@ def propose_swelling(barostat, model, state, workspace, h, draw):
     for k in range(3):
         workspace.strain[0, k] = barostat.strain
     boxes.set_matrices(workspace)
+    return True
 
 
 @implements(boxes.rescale_velocities, Swelling)

@@ -24,6 +24,7 @@ SHORTEST_CUTOFF = 0.5
 LIGHTEST, HEAVIEST, HYDROGENS = 0.85, 1.1, 4.1
 #: Angles (degrees) that are a multiple of this in radians, to this many degrees, are probably in radians.
 ROUND_ANGLE, ROUNDED = 5.0, 0.4
+HEAVIEST_ELEMENT = 300.0  # u
 ATMOSPHERE_PA, TO_ATMOSPHERE = 101325.0, 0.03
 COLDEST_LIQUID = 100.0  # K, of water that starts without a file
 
@@ -70,6 +71,8 @@ def scene_errors(scene: MolecularScene, species: list[Molecule], counts: np.ndar
     density = 0.0 if space.volume == inf else mass / space.volume / GRAM_PER_CM3
     key = "box.density_g_cm3" if scene.box.density_g_cm3 is not None else "the density of the box"
     found = outside("density", scene.box.density_g_cm3 or density, key)
+    if max(m.masses.max() for m in species) > HEAVIEST_ELEMENT:
+        found = None  # sites of a model that is not of atoms
     faults = [found[0]] if found is not None and found[1] else []
     contact = shortest_contact(species)
     cutoff = scene.forces.cutoff_A

@@ -34,6 +34,10 @@ class Coupling(NamedTuple):
     in_trajectories: bool = False  # whether steps are accepted or rejected together
     time: Callable[[Values], float] = lambda values: values["thermostat_time_ps"]
     description: Callable[[Values], str] = lambda values: f"{values['thermostat_time_ps']:g} ps"
+    #: Whether its time constant is the period of an oscillation, which steps have to resolve, or the relaxation time of
+    #: moves, which has to be longer than the time between two of them.
+    oscillates: bool = False
+    relaxes_in_moves: bool = False
     #: For a barostat: how the box may change; whether its flows are parts of velocity Verlet steps, of which the
     #: integrator then has to consist; its name in reports, if it is another one.
     shapes: tuple[str, ...] = get_args(Shapes)
@@ -80,7 +84,7 @@ THERMOSTATS = {
     "nose_hoover": Coupling(
         "one chain for translation and one for rotation",
         "Martyna, Tuckerman, Tobias & Klein 1996, Mol. Phys. 87, 1117",
-        {"thermostat_time_ps": 0.5, "nose_hoover_links": 3},
+        {"thermostat_time_ps": 0.5, "nose_hoover_links": 3}, oscillates=True,
     ),
     "andersen": Coupling(
         "collisions", "Andersen 1980, J. Chem. Phys. 72, 2384", {"thermostat_time_ps": 1.0}, on_molecules=True,
@@ -98,7 +102,7 @@ BAROSTATS = {
     "cell_rescaling": Coupling(
         "stochastic cell rescaling, made exact by a Metropolis test",
         "Bernetti & Bussi 2020, J. Chem. Phys. 153, 114107",
-        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval}, ("npt",),
+        {"barostat_time_ps": BAROSTAT_TIME, "barostat_interval_ps": _interval}, ("npt",), relaxes_in_moves=True,
     ),
     "monte_carlo": Coupling(
         "random changes of the volume", "Åqvist et al. 2004, Chem. Phys. Lett. 384, 288",
@@ -107,6 +111,7 @@ BAROSTATS = {
     "piston": Coupling(
         "a volume with inertia and without friction", "Andersen 1980, J. Chem. Phys. 72, 2384",
         {"barostat_time_ps": BAROSTAT_TIME}, ("nph",), shapes=("isotropic",), in_verlet_steps=True, title="a piston",
+        oscillates=True,
     ),
 }  # fmt: skip
 

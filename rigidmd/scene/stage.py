@@ -231,11 +231,12 @@ class Stage(MovedByScheme, BarostatKeys, ThermostatKeys, Timing):
             return
         step = self.timestep_fs * FEMTOSECOND
         least = pi * step
-        if self.thermostat_kind == "nose_hoover" and self.thermostat_time < least:
+        thermostat, barostat = THERMOSTATS.get(self.thermostat_kind), BAROSTATS.get(self.barostat_kind)
+        if thermostat and thermostat.oscillates and self.thermostat_time < least:
             yield f"thermostat_time_ps = {self.thermostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
-        if self.barostat_kind == "piston" and self.barostat_time < least:
+        if barostat and barostat.oscillates and self.barostat_time < least:
             yield f"barostat_time_ps = {self.barostat_time:g} is a period shorter than pi steps, {least:.3g} ps"
-        moves = self.moves_every * step if self.barostat_kind == "cell_rescaling" else 0.0
+        moves = self.moves_every * step if barostat and barostat.relaxes_in_moves else 0.0
         if self.barostat_time < moves:
             yield f"barostat_time_ps = {self.barostat_time:g} is shorter than the {moves:g} ps between moves of the box"
 
