@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numba
 from filelock import FileLock, Timeout
 from numba import types
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache, UserProvidedCacheLocator
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache, _CacheLocator
 
 from rigidmd.compile.machine import CODE_SETTINGS, SIMD_BITS
 from rigidmd.core.files import untrusted_reason
@@ -374,7 +374,7 @@ def open_cache(function: Callable) -> FunctionCache | NullCache:
 
 def _make_subfolder(folder: str, function: Callable) -> bool:
     """Make the folder for the functions of a source file, before Numba makes it; whether it can be used."""
-    subfolder = Path(folder) / UserProvidedCacheLocator.get_suitable_cache_subpath(inspect.getfile(function))
+    subfolder = Path(folder) / _CacheLocator.get_suitable_cache_subpath(inspect.getfile(function))
     try:
         subfolder.mkdir(mode=0o700, exist_ok=True)
         problem = _untrusted_folder(subfolder)
