@@ -34,7 +34,7 @@ from rigidmd.compile import (
     task,
 )
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
-from rigidmd.compile.code import array_struct
+from rigidmd.compile.records import array_struct
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ def test_arrays_are_stored_as_assumed():
     size = context.get_abi_sizeof(context.get_value_type(kind))
     assert (fields, ctypes.sizeof(assumed)) == (stored, size), (
         f"Numba {numba.__version__} stores an array as {stored} (name, bytes), {size} bytes in all; rigidmd/compile/"
-        f"code.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `_c_value` there"
+        f"records.py assumes {fields}, {ctypes.sizeof(assumed)} bytes in all: change `array_struct` and `c_value` there"
     )
 
 

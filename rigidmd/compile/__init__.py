@@ -7,9 +7,10 @@ The names that the author of a term needs are exported here; `simd` has the vect
 # ruff: noqa: F401  (other packages import these names from here)
 from rigidmd.compile import settings  # before Numba is loaded
 from rigidmd.compile.code import (
-    BoundTask, Code, CompiledTask, NumbaStruct, TaskArguments, call, call_blocks, compile_together, load_arguments,
+    BoundTask, Code, CompiledTask, TaskArguments, call, call_blocks, compile_together, load_arguments,
     pack_arguments, task,
 )  # fmt: skip
 from rigidmd.compile.kernels import chosen_by_type, implements, is_a, kernel
 from rigidmd.compile.machine import BLOCKS, MOST_BLOCKS, SIMD_BITS
+from rigidmd.compile.records import NumbaStruct
 from rigidmd.compile.thread_pool import call_address, set_threads

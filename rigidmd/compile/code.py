@@ -1,9 +1,4 @@
-"""Tasks: machine code that is called by address. Each address carries the type for which the code was compiled.
-
-Private parts of Numba, tested by tests/test_compile.py: the values of tuples and of `ArrayModel` are C structs, which
-`NumbaStruct` fills. A call from Python would instead compile code that unpacks every array of every argument, a second
-of compiling for the forty arrays of a term, and every call would run all of it.
-"""
+"""Tasks: machine code that is called by address. Each address carries the type for which the code was compiled."""
 
 import contextlib
 import ctypes
@@ -16,8 +11,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
-from functools import cache
-from typing import Any
 
 import numba
 import numpy as np
@@ -32,73 +25,23 @@ from rigidmd.compile import thread_pool
 from rigidmd.compile.cache import is_persistent, lock_in_cache
 from rigidmd.compile.kernels import NotStored, chosen_by_type, compile_callback, compiler_options
 from rigidmd.compile.machine import MOST_THREADS, cast_pointer, pointer_to
+from rigidmd.compile.records import NumbaStruct, by_reference, load_invariant, stored_by_reference
 from rigidmd.core.process import python_process
 from rigidmd.errors import SettingError
 
-# --- values in memory ------------------------------------------------------------------------------------------------
-
-#: C types of the numbers of compiled code.
-C_TYPES = {types.boolean: ctypes.c_bool, types.float64: ctypes.c_double, types.float32: ctypes.c_float} | {
-    kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64
-}
 #: Longest time to wait for the code of another process, s.
 LONGEST_WAIT = 120.0
-
-
-class NumbaStruct:
-    """A value in memory as compiled code stores it, at `address`. Its arrays are kept here, and not reference-counted.
-
-    Raises TypeError if the value contains anything but numbers, arrays, None, codes, and tuples of these.
-    """
-
-    def __init__(self, value: Any):
-        self.value, self.kind = value, numba.typeof(value)
-        self._memory = _c_value(self.kind, value)
-        self.address = ctypes.addressof(self._memory)
-
-
-def _c_value(kind: types.Type, value: Any) -> Any:
-    """A value as an object of ctypes with its own memory."""
-    if isinstance(kind, types.Array):
-        struct, numbers = array_struct(kind.ndim), ctypes.c_ssize_t * kind.ndim
-        sizes = value.size, value.itemsize, value.ctypes.data
-        return struct(None, None, *sizes, numbers(*value.shape), numbers(*value.strides))
-    if isinstance(kind, types.BaseTuple):
-        parts = [_c_value(*pair) for pair in zip(kind.types, value, strict=True)]
-        return _struct(tuple((f"item_{k}", type(part)) for k, part in enumerate(parts)))(*parts)
-    if isinstance(kind, CodeType):
-        return ctypes.c_int64(value.address_value)
-    if kind is types.none:
-        return ctypes.c_void_p()
-    if kind not in C_TYPES:
-        raise TypeError(f"a value of type {kind} cannot be an argument of a task")
-    return C_TYPES[kind](value)
-
-
-@cache
-def _struct(fields: tuple[tuple[str, Any], ...]) -> type[ctypes.Structure]:
-    """The C struct of named values, each aligned to its own size, like a struct of LLVM."""
-    return type("NumbaTuple", (ctypes.Structure,), {"_fields_": fields})
-
-
-@cache
-def array_struct(dimensions: int) -> type[ctypes.Structure]:
-    """The C struct of an array, with the fields of Numba's `ArrayModel` in the same order."""
-    numbers = ctypes.c_ssize_t * dimensions
-    owners = ("meminfo", ctypes.c_void_p), ("parent", ctypes.c_void_p)
-    content = ("nitems", ctypes.c_ssize_t), ("itemsize", ctypes.c_ssize_t), ("data", ctypes.c_void_p)
-    return _struct((*owners, *content, ("shape", numbers), ("strides", numbers)))
 
 
 # --- tasks -----------------------------------------------------------------------------------------------------------
 
 
 class TaskArguments(types.Type):
-    """Numba type of the address of a task's arguments, a value of any type."""
+    """Numba type of the address of a task's arguments, a value of any type whose named tuples are records."""
 
     def __init__(self, content):
-        self.content = content
-        super().__init__(f"task_arguments({content})")
+        self.content = by_reference(content)
+        super().__init__(f"task_arguments({self.content})")
 
     @property
     def key(self):
@@ -114,7 +57,8 @@ def pack_arguments(typing, content):
     """The address of a value on the stack, valid until the calling function returns."""
 
     def emit(context, builder, signature, arguments):
-        return builder.bitcast(cgutils.alloca_once_value(builder, arguments[0]), cgutils.voidptr_t)
+        value = stored_by_reference(context, builder, content, arguments[0])
+        return builder.bitcast(cgutils.alloca_once_value(builder, value), cgutils.voidptr_t)
 
     return TaskArguments(content)(content), emit
 
@@ -125,7 +69,7 @@ def load_arguments(typing, task_arguments):
 
     def emit(context, builder, signature, arguments):
         kind = context.get_value_type(task_arguments.content)
-        content = builder.load(cast_pointer(builder, arguments[0], kind), typ=kind)
+        content = load_invariant(builder, cast_pointer(builder, arguments[0], kind), kind)
         return impl_ret_borrowed(context, builder, task_arguments.content, content)
 
     return task_arguments.content(task_arguments), emit

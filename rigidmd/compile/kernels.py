@@ -29,6 +29,7 @@ from numba.core.registry import CPUDispatcher
 from numba.extending import overload
 
 from rigidmd.compile.cache import open_cache
+from rigidmd.compile.records import Record
 
 #: Error that compiling a user's function may raise.
 CompileError = NumbaError
@@ -115,8 +116,9 @@ def compiler_options(inline: bool = False, count_references: bool = True) -> dic
 
 
 def is_a(numba_type, named_tuple) -> bool:
-    """Whether a Numba type belongs to the given NamedTuple class; for overloads that choose by type."""
-    return isinstance(numba_type, types.BaseNamedTuple) and numba_type.instance_class is named_tuple
+    """Whether a Numba type is a NamedTuple class or a record of it; for overloads that choose by type."""
+    is_tuple = isinstance(numba_type, types.BaseNamedTuple | Record)
+    return is_tuple and numba_type.instance_class is named_tuple
 
 
 def _without_literal(kind: types.Type) -> types.Type:
