@@ -34,8 +34,8 @@ from rigidmd.compile import (
     task,
 )
 from rigidmd.compile.cache import CacheIndex, cache_folder, compiling_announced
-from rigidmd.compile.records import array_struct
 from rigidmd.compile.kernels import InnerKernel, KernelDispatcher, LinkedLibrary, compile_callback
+from rigidmd.compile.records import array_struct
 
 # --- what Numba does not promise -------------------------------------------------------------------------------------
 

@@ -34,6 +34,8 @@ from rigidmd.commands.cli import main
 from rigidmd.engines.cpu.engine import CpuEngine
 from rigidmd.errors import RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Simulation
+from rigidmd.run import minimise as minimise_module
+from rigidmd.run.minimise import precision_of_minimisation
 from rigidmd.scene import Scene
 from rigidmd.units import BAR, BOLTZMANN, COULOMB, KJ_PER_MOL
 
@@ -619,7 +621,7 @@ def test_structures_that_overlap_may_be_minimised(tmp_path):
 
 
 def test_compiling_is_not_minimising(monkeypatch):
-    """The first forces in double precision, which may compile for a minute, come before the clock of the stage."""
+    """The first forces, which may compile for a minute, come before the clock of the stage, in its precision."""
     from rigidmd.run import molecular
 
     order = []
@@ -635,10 +637,65 @@ def test_compiling_is_not_minimising(monkeypatch):
 
     monkeypatch.setattr(CpuEngine, "evaluate", evaluate_and_record)
     monkeypatch.setattr(molecular, "minimise", minimise_and_record)
-    stages = [stage_of(most_iterations=2), {"duration_ps": 0.002}, stage_of(most_iterations=2)]
+    stages = [
+        stage_of(most_iterations=2, **TIGHT),
+        {"duration_ps": 0.002},
+        stage_of(most_iterations=2),
+    ]
     Simulation(small_scene({"argon": 20}, 20.0, stages=stages, precision="mixed"), warn=str).run()
     assert order.count("minimise") == 2
     assert "forces in float64" in order[: order.index("minimise")]
+
+
+@pytest.mark.parametrize(
+    ("counts", "limit", "precision"),
+    [
+        ({"spce": 10}, 10.0, "mixed"),
+        ({"argon": 10}, 0.1, "mixed"),
+        ({"spce": 10}, 1e-4, "double"),
+        ({"argon": 10}, 1e-5, "double"),
+    ],
+)
+def test_loose_limits_need_no_double_precision(counts, limit, precision):
+    """The minimum is the same to the error of mixed precision; no kernel of double precision is loaded."""
+    limits = {"force_limit_kJ_mol_A": limit, "torque_limit_kJ_mol": limit}
+    energies = {}
+    for each in ("mixed", "double"):
+        scene = small_scene(counts, 18.5, stages=[stage_of(**limits)], precision=each)
+        system, _, state = shaken(build(scene), 1, spread=0.1)
+        minimum = minimise(system, state, scene.stages[0])
+        assert minimum.converged
+        assert minimum.precision == (precision if each == "mixed" else "double")
+        at_minimum, _ = system.engine_of(system.terms, "double").evaluate(state)
+        assert np.linalg.norm(at_minimum.force, axis=1).max() < 1.01 * limit * KJ_PER_MOL
+        energies[each] = minimum.energy_after
+    assert energies["mixed"] == pytest.approx(energies["double"], rel=1e-4 if limit < 10 else 0.1)
+
+
+def test_a_pressure_is_found_in_double_precision():
+    scene = small_scene({"argon": 20}, 20.0, stages=[stage_of(pressure_bar=1.0)], precision="mixed")
+    assert precision_of_minimisation(build(scene), scene.stages[0]) == "double"
+
+
+def test_where_mixed_precision_stalls_double_precision_continues(monkeypatch):
+    """Also from a start whose energy single precision cannot hold: two sites 0.001 Å apart."""
+    scene = small_scene({"argon": 10}, 18.5, stages=[stage_of()], precision="mixed")
+    system, _, state = shaken(build(scene), 1, spread=0.1)
+    overlapping = state.copy()
+    minimum = minimise(system, state, scene.stages[0])
+    assert minimum.precision == "mixed"
+    overlapping.position[1] = overlapping.position[0] + [0.001, 0.0, 0.0]
+    assert minimise(system, overlapping, scene.stages[0]).precision == "double"
+    step = minimise_module._Descent.step
+
+    def stall_in_mixed_precision(descent, point):
+        return None if descent._enthalpy.precision == "mixed" else step(descent, point)
+
+    monkeypatch.setattr(minimise_module._Descent, "step", stall_in_mixed_precision)
+    _, _, state = shaken(build(scene), 1, spread=0.1)
+    stalled = minimise(system, state, scene.stages[0])
+    assert (stalled.converged, stalled.precision) == (True, "double")
+    assert stalled.energy_after == pytest.approx(minimum.energy_after, rel=1e-4)
 
 
 @pytest.mark.parametrize("field", [5.3, 8.0])

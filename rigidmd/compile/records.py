@@ -29,11 +29,7 @@ C_TYPES = {
     types.boolean: ctypes.c_bool,
     types.float64: ctypes.c_double,
     types.float32: ctypes.c_float,
-} | {
-    kind: getattr(ctypes, f"c_{kind.name}")
-    for kind in sorted(types.integer_domain, key=str)
-    if kind.bitwidth <= 64
-}
+} | {kind: getattr(ctypes, f"c_{kind.name}") for kind in sorted(types.integer_domain, key=str) if kind.bitwidth <= 64}
 
 
 class Record(types.Type):
@@ -47,6 +43,9 @@ class Record(types.Type):
     def key(self):
         """The type of the named tuple. The name does not identify it: classes of the same name have the same."""
         return self.content
+
+    def __len__(self) -> int:
+        return len(self.fields)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -140,9 +139,7 @@ class NumbaStruct:
             self._records.append(record)
             return ctypes.c_void_p(ctypes.addressof(record))
         if isinstance(kind, types.BaseTuple):
-            return _tuple_struct(
-                self._reference(part, one) for part, one in zip(kind.types, value, strict=True)
-            )
+            return _tuple_struct(self._reference(part, one) for part, one in zip(kind.types, value, strict=True))
         return c_value(kind, value)
 
 

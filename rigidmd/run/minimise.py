@@ -5,15 +5,17 @@ Both move a state to one near it: the first until molecules on a lattice are not
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from math import inf, isfinite, nan
 from typing import NamedTuple
 
 import numpy as np
 
+from rigidmd.assemble.time_step import MIXED_ERROR
 from rigidmd.core.state import WORK, Load, State
 from rigidmd.dynamics.barostats import COMPONENTS, COUPLINGS, LONGEST_DRIFT
 from rigidmd.dynamics.model import mobile
-from rigidmd.engines.cpu.engine import BehindWallError
+from rigidmd.engines.cpu.engine import BehindWallError, Precision
 from rigidmd.engines.protocol import Engine
 from rigidmd.engines.system import System
 from rigidmd.errors import SimulationError
@@ -22,8 +24,10 @@ from rigidmd.run import checks
 from rigidmd.run.checks import kicks
 from rigidmd.run.summary import Minimum
 from rigidmd.scene.stage import Stage
-from rigidmd.units import BAR, KJ_PER_MOL
+from rigidmd.units import BAR, COULOMB, KJ_PER_MOL
 
+#: Rounding error of an energy relative to the sum of its parts.
+ROUNDING: dict[Precision, float] = {"double": 1e-13, "mixed": 3e-7}
 MOST_STEPS = 2000
 LONGEST_MOVE = 0.1  # in a step, as a fraction of `scale`
 
@@ -120,13 +124,15 @@ class Enthalpy:
         the guide `ensembles` has the reason and a measurement
 
     Axes without inertia do not rotate. The derivative for the strain follows from the molecular virial W = sum F (x) R,
-    dU/dT_ij = -W_ji. Forces are in double precision, as energies need many digits near a minimum.
+    dU/dT_ij = -W_ji.
 
     state : its volume scales the strain
+    precision : of the forces between sites; energies near a minimum need the digits of double precision
     """
 
-    def __init__(self, system: System, stage: Stage, state: State):
-        self._system, self.engine = system, system.engine_of(system.terms, "double")
+    def __init__(self, system: System, stage: Stage, state: State, precision: Precision = "double"):
+        self._system, self.engine = system, system.engine_of(system.terms, precision)
+        self.precision, self.rounding = precision, ROUNDING[precision]
         self.free, (self.rotates, self.arm) = mobile(system.model), _rotations(system, state)
         #: Coordinate of each component of the strain; -1: none.
         self.coordinate = np.array(COUPLINGS[stage.pressure_coupling] if stage.changes_box else [-1] * 6)
@@ -214,8 +220,8 @@ DECREASE = 1e-4
 #: Where rounding hides the gain, the slope at the end of a move decides: it may have at most this fraction of its size
 #: at the start, with the other sign (Hager & Zhang 2005, SIAM J. Optim. 16, 170, eq. 4.1 with delta = 0.1).
 OPPOSITE_SLOPE = 0.8
-#: Rounding error of an energy relative to the sum of its parts.
-ROUNDING = 1e-13
+#: A limit of this many errors of mixed precision hides these.
+HIDDEN_ERRORS = 30
 #: Most trial moves along a direction; each is at most half as long as the one before.
 TRIALS = 30
 #: If a move fails with an error even after it has been shortened by this factor, the error is final.
@@ -224,6 +230,34 @@ SHORTEST = 1e-3
 OVERLAPPING = 1000.0
 #: Iterations between two searches for opposite charges on top of each other.
 SEARCH_INTERVAL = 100
+
+
+def precision_of_minimisation(system: System, stage: Stage) -> Precision:
+    """The precision of the scene where the limits of a stage are far above the error of its forces, else double.
+
+    Forces are as strong as those of the deepest well and of the largest charges at one diameter. A pressure is the
+    small difference of large parts, so that a cell relaxes in double precision.
+    """
+    if stage.changes_box:
+        return "double"
+    diameter = system.smallest_diameter
+    wells = 24 * max((m.epsilon.max(initial=0.0) for m in system.species), default=0.0) / diameter
+    charges = max((np.abs(m.charge).max(initial=0.0) for m in system.species), default=0.0)
+    force = max(wells, COULOMB * charges**2 / diameter**2)
+    limit = min(stage.force_limit_kJ_mol_A, stage.torque_limit_kJ_mol / diameter) * KJ_PER_MOL
+    return system.precision if limit >= HIDDEN_ERRORS * MIXED_ERROR * force else "double"
+
+
+def _first_point(system: System, stage: Stage, state: State) -> tuple[Enthalpy, EnthalpyPoint]:
+    """The enthalpy in the precision of a stage, or in double precision if the other has no numbers large enough."""
+    if precision_of_minimisation(system, stage) == "mixed":
+        with suppress(SimulationError):
+            enthalpy = Enthalpy(system, stage, state, "mixed")
+            point = enthalpy.at(state.copy())
+            if point.is_finite:
+                return enthalpy, point
+    enthalpy = Enthalpy(system, stage, state)
+    return enthalpy, enthalpy.at(state.copy())
 
 
 def minimise(
@@ -238,12 +272,15 @@ def minimise(
     The optimisers of libraries are not suitable: rotations form no vector space, so each iteration starts from the
     present orientations, and an unbounded line search can put a charge without repulsion on an opposite charge.
 
+    Forces have the precision of the scene if the limits are far above its error, and double precision from where no
+    move lowers the energy in the other.
+
     stop : called before each iteration; the minimisation ends if it is true; advanced : called after each with 1
 
     Raises SimulationError if the energy has no lower bound or is not a finite number, or the box grows without bound.
     """
-    enthalpy = Enthalpy(system, stage, state)
-    point = start = enthalpy.at(state.copy())
+    enthalpy, point = _first_point(system, stage, state)
+    start = point
     if not start.is_finite:
         raise SimulationError("energy or forces are not finite numbers: sites of different molecules coincide")
     overlap_steps, deepest = 0, max((m.epsilon.max() for m in system.species), default=0.0)
@@ -268,10 +305,8 @@ def minimise(
             ended_by = f"most_iterations = {stage.most_iterations}"
         elif stop():
             ended_by = "interrupted"
-        elif (found := descent.step(point)) is None:
-            ended_by = "no move lowers the energy any further"
-        else:
-            point, iterations = found, iterations + 1
+        elif (lower := descent.step(point)) is not None:
+            point, iterations = lower, iterations + 1
             advanced(1)
             largest, grown = system.scene.watch.volume, point.state.volume / start.state.volume
             if point.state.volume < inf and largest and grown > largest:
@@ -282,6 +317,12 @@ def minimise(
                 )
             if iterations % SEARCH_INTERVAL == 0:
                 _check_charges(system, point)
+        elif enthalpy.precision == "mixed":
+            enthalpy = Enthalpy(system, stage, state)
+            start, point = enthalpy.at(start.state), enthalpy.at(point.state)
+            descent = _Descent(enthalpy)
+        else:
+            ended_by = "no move lowers the energy any further"
     if not converged:
         _check_charges(system, point)
     for name in ("position", "rotation", "cell"):
@@ -290,7 +331,7 @@ def minimise(
     pressure = tuple(point.pressure.tolist()) if np.isfinite(point.pressure).all() else None
     return Minimum(
         converged, ended_by, iterations, overlap_steps, start.energy, point.energy, force, torque, pressure,
-        deviation if stage.changes_box else None,
+        deviation if stage.changes_box else None, enthalpy.precision,
     )  # fmt: skip
 
 
@@ -343,7 +384,7 @@ class _Descent:
 
     def _along(self, point: EnthalpyPoint, direction: np.ndarray) -> tuple[np.ndarray, EnthalpyPoint] | None:
         """An accepted move along a direction, and the point it leads to; None without one. Raises SimulationError."""
-        slope, length, noise = float(direction @ point.gradient), 1.0, ROUNDING * point.scale
+        slope, length, noise = float(direction @ point.gradient), 1.0, self._enthalpy.rounding * point.scale
         for _ in range(TRIALS):
             move = length * direction
             try:

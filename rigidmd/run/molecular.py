@@ -31,7 +31,7 @@ from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import check_forces, coulomb_errors, velocity_notes
-from rigidmd.run.minimise import Enthalpy, OverlapRemoval, minimise, remove_overlaps
+from rigidmd.run.minimise import Enthalpy, OverlapRemoval, minimise, precision_of_minimisation, remove_overlaps
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
 from rigidmd.run.part import RunPart
@@ -224,7 +224,8 @@ class MolecularRun(RunPart):
         """Compile what stage k runs, so that its computing time does not contain it."""
         stage, state = self.scene.stages[k], self.state
         if stage.is_minimisation:
-            enthalpy = Enthalpy(self.system, stage, state)
+            precision = precision_of_minimisation(self.system, stage)
+            enthalpy = Enthalpy(self.system, stage, state, precision)
             point = enthalpy.at(state.copy())
             enthalpy.moved(point.state, np.zeros(len(point.gradient)))
         elif not self.scene.engine.is_external:

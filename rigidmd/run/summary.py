@@ -56,6 +56,7 @@ class Minimum(NamedTuple):
     torque: float  # largest torque about a principal axis
     pressure: tuple[float, ...] | None  # six, by `barostats.COMPONENTS`, without the kinetic part; None without a box
     deviation: float | None  # largest deviation from the requested pressure; None if the cell does not relax
+    precision: str = "double"  # of the last forces
 
 
 def summarise(
@@ -313,6 +314,7 @@ def minimum_figures(found: Minimum, molecules: int) -> dict[str, Any]:
     pressure = None if found.pressure is None else np.array(found.pressure) / BAR
     return {
         "converged": found.converged, "ended_by": found.ended_by or None, "iterations": found.iterations,
+        "precision": found.precision,
         "relief_steps": found.overlap_steps,
         "energy_before_kJ_mol_per_molecule": found.energy_before / KJ_PER_MOL / molecules,
         "energy_after_kJ_mol_per_molecule": found.energy_after / KJ_PER_MOL / molecules,
