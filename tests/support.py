@@ -309,7 +309,7 @@ HOMES = {
     "io.structure_file": "read_atoms read_geometry",
     "io.formats.through_ase": "EV TrajFile TrajReader",
     "compile": "SIMD_BITS implements call call_blocks pack_arguments",
-    "compile.cache": "COMPILED CacheIndex cache_folder source_digest",
+    "compile.cache": "CacheIndex cache_folder compiler_digest",
     "compile.simd": "lane_count",
     "compile.machine": "MOST_THREADS",
     "commands.arguments": "COMMANDS read_scene",

@@ -9,7 +9,7 @@ import tomllib
 from fnmatch import fnmatch
 
 import pytest
-from support import BY_EXTENSION, COMPILED, ROOT
+from support import BY_EXTENSION, ROOT
 
 PACKAGE = ROOT / "rigidmd"
 
@@ -134,21 +134,26 @@ def test_each_library_has_its_packages(library):
     assert not strange, "\n".join(strange)
 
 
-def test_the_digest_that_names_the_cache_includes_all_compiled_code():
-    """A kernel in a file outside of `cache.COMPILED`, or a constant from outside, would stay old after a change."""
+#: Packages and files with kernels, and those that ask for the processor, the cache or its sources.
+COMPILED = (
+    "compile",
+    "mechanics",
+    "forces",
+    "dynamics",
+    "analysis/pair_histogram.py",
+    "engines/protocol.py",
+    "engines/cpu",
+    "engines/ode",
+)
+ASKED_BY_OTHERS = {"rigidmd.compile.machine", "rigidmd.compile.cache"}
+
+
+def test_only_packages_of_kernels_compile():
     for path in FILES:
-        ours = [(line, module) for line, module in imports(path) if module.startswith("rigidmd.")]
-        if is_compiled(name_of(path)):
-            strange = [
-                f"{line}: {m}"
-                for line, m in ours
-                if not is_compiled(f"{m.removeprefix('rigidmd.').replace('.', '/')}.py")
-            ]
-            assert not strange, f"{name_of(path)} is compiled and imports {strange}"
-        else:
-            kernels = [m for _, m in ours if m.startswith("rigidmd.compile")]
-            allowed = {"rigidmd.compile.machine", "rigidmd.compile.cache"}  # about the processor and the cache
-            assert set(kernels) <= allowed, f"{name_of(path)} compiles"
+        name = name_of(path)
+        if not any(name == entry or name.startswith(f"{entry}/") for entry in COMPILED):
+            used = {m for _, m in imports(path) if m.startswith("rigidmd.compile")}
+            assert used <= ASKED_BY_OTHERS, f"{name} compiles"
 
 
 #: Files that name extensions of structures or trajectories in texts for users -> what for.
@@ -175,11 +180,6 @@ def test_only_a_format_names_its_extensions():
     strange = {name: texts for name, texts in naming.items() if not name.startswith("io/formats/")}
     assert set(strange) == set(NAMED_EXTENSIONS), strange
     assert len(naming) >= len(strange) + 8  # the registry and seven modules
-
-
-def is_compiled(name):
-    parts = name.removesuffix(".py")
-    return any(name == entry or parts == entry or name.startswith(f"{entry}/") for entry in COMPILED)
 
 
 def test_core_compiles_nothing():

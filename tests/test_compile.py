@@ -385,7 +385,7 @@ def test_the_cache_folder_is_swept_of_nothing_but_our_own(tmp_path):
     assert [folder.exists() for folder in old] == [True, False, True]
 
 
-MACHINE = "from rigidmd.compile import cache, machine; print(machine.SIMD_BITS, cache.source_digest())"
+MACHINE = "from rigidmd.compile import cache, machine; print(machine.SIMD_BITS, cache.compiler_digest())"
 
 
 def machine_with(**settings):

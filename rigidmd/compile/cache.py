@@ -1,8 +1,9 @@
 """The cache of compiled code: its folder and its index.
 
 Numba's disk cache checks only the file of the function itself: after a change of a function in another file, callers
-would run the old code. So the name of the folder contains a digest of all compiled sources, and any change of a source
-starts a new folder. The environment variable `RIGIDMD_CACHE` sets another parent folder.
+would run the old code. So each index is named by a digest of the definitions that its kernel reaches (`sources`), and
+the folder by one of this package, the version of Numba and its settings. An edited docstring compiles nothing, a
+changed function what calls it. The environment variable `RIGIDMD_CACHE` sets another parent folder.
 
 The cache holds machine code and pickles, which are executed. It is therefore used only if this user, or root, owns its
 folders and files and nobody else may write to them. Without such a folder, code is stored in a temporary one, which
@@ -38,32 +39,22 @@ from filelock import FileLock, Timeout
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache, _CacheLocator
 
+from rigidmd.compile import sources
 from rigidmd.compile.machine import CODE_SETTINGS, SIMD_BITS
 from rigidmd.core.files import untrusted_reason
 from rigidmd.core.user_modules import GENERATED_PREFIX
 from rigidmd.errors import RigidMDWarning
 
-PACKAGE = Path(__file__).parent.parent
-#: Files and folders with kernels; tests/test_architecture.py checks that no other file has one.
-COMPILED = (
-    "errors.py", "units.py", "core/files.py", "core/integrators.py", "core/process.py", "core/state.py", "core/toml.py",
-    "core/user_modules.py", "compile", "mechanics", "forces", "dynamics", "analysis/pair_histogram.py",
-    "engines/protocol.py", "engines/cpu", "engines/ode",
-)  # fmt: skip
 UNUSED_AFTER_DAYS = 30.0
 INDEX_WAIT = 20.0  # for the index that another process changes, s
 OTHERS_WRITE = 0o022  # permissions of group and others
 
 
 @functools.cache
-def source_digest() -> str:
-    """Hexadecimal digest of compiled sources, Numba's version and settings, and the width of vectors."""
-    digest = hashlib.sha256(f"{numba.__version__} {SIMD_BITS} {CODE_SETTINGS}".encode())
-    named = [PACKAGE / name for name in COMPILED]
-    for path in sorted(path for one in named for path in ([one] if one.is_file() else one.rglob("*.py"))):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+def compiler_digest() -> str:
+    """Hexadecimal digest of this package, Numba's version and settings, and the width of vectors."""
+    settings = f"{numba.__version__} {SIMD_BITS} {CODE_SETTINGS} {sources.package_digest()}"
+    return hashlib.sha256(settings.encode()).hexdigest()[:16]
 
 
 class CacheFolders(NamedTuple):
@@ -96,13 +87,14 @@ def _base_folder() -> Path | None:
 def cache_folders() -> CacheFolders:
     """The folders of compiled code, which are made when the first kernel is compiled.
 
-    Folders of older sources that were not used for a month are removed.
+    Folders of other versions, and files, that were not used for a month are removed.
     """
     base = _base_folder()
     if base is None:
         return CacheFolders(_temporary_folder(), None, "this user has no home folder")
     base = Path(os.path.realpath(base))
-    folder = base / f"kernels-{source_digest()}"
+    sources.read_stored(base)
+    folder = base / f"kernels-{compiler_digest()}"
     if problem := _unwritable_reason(base, folder):
         is_shared = not any(_untrusted_folder(one) for one in (base, folder))
         return CacheFolders(_temporary_folder(), str(folder) if is_shared else None, problem)
@@ -148,12 +140,21 @@ def _temporary_folder() -> str | None:
 
 
 def _remove_unused(base: Path) -> None:
-    """Remove the folders of sources that were not used for a month."""
-    for old in base.iterdir():
+    """Remove the folders that were not used for a month, and in the others the files of which this is true."""
+    for folder in base.iterdir():
+        if not re.fullmatch(r"kernels-[0-9a-f]{16}", folder.name) or not folder.is_dir():
+            continue
         with contextlib.suppress(OSError):
-            is_cache = re.fullmatch(r"kernels-[0-9a-f]{16}", old.name) and old.is_dir()
-            if is_cache and time.time() - old.stat().st_mtime > UNUSED_AFTER_DAYS * 86400:
-                shutil.rmtree(old)
+            if _is_unused(folder):
+                shutil.rmtree(folder)
+                continue
+            for path in folder.glob("*/*.nb[ic]*"):
+                if _is_unused(path):
+                    path.unlink()
+
+
+def _is_unused(path: Path) -> bool:
+    return time.time() - path.stat().st_mtime > UNUSED_AFTER_DAYS * 86400
 
 
 def cache_folder() -> str | None:
@@ -216,15 +217,18 @@ class UnreadableError(Exception):
 class CacheIndex(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
-    Code for types from outside the package has a separate index, because an index cannot be read if one of its types
-    cannot be imported. Such code is stored only if the name of the module follows from its source
-    (`core.user_modules`). Changes of other modules are not noticed, so that old code would run. An index that this
-    process cannot read is not replaced: other processes may be able to read it.
+    Each index belongs to the definitions that its function reaches, those of the classes in the types of its arguments
+    included, so that an index can be read where these classes are. Code for types of modules from outside of the
+    package is stored only if the name of the module follows from its source (`core.user_modules`). Changes of other
+    modules are not noticed, so that old code would run. An index that this process cannot read is not replaced: other
+    processes may be able to read it.
     The files of machine code have random names. Numba numbers them, and two processes that compiled at the same time
     for different types wrote to the same file, after which every run crashed. Every file begins with a checksum; a
     damaged file is ignored, and its code is compiled again. A folder for all users is also read, see
-    `cache.shared_folder`.
+    `cache_folders`.
     """
+
+    function: Callable | None = None  # whose code it has
 
     def load(self, key):
         """A compiled function; None if it is not stored."""
@@ -255,15 +259,16 @@ class CacheIndex(IndexDataCacheFile):
             return None
 
     def _index_for(self, key) -> "CacheIndex | None":
-        """The index for the types of a key; None if their code is not stored."""
-        modules = sorted(set(_outside_modules(getattr(key[0], "args", key[0]))))
-        if not modules:
-            return self
-        if not all(name.startswith(GENERATED_PREFIX) for name in modules):
+        """The index for the types of a key and the present sources; None if their code is not stored."""
+        classes = set(_classes_in(getattr(key[0], "args", key[0])))
+        outside = {one.__module__ for one in classes if not _is_of_package(one.__module__)}
+        if not all(name.startswith(GENERATED_PREFIX) for name in outside):
             return None
+        roots = {sources.node_of(one) for one in classes}
+        if self.function is not None:
+            roots.add(sources.node_of(self.function))
         index = copy.copy(self)
-        digest = hashlib.sha256(" ".join(modules).encode()).hexdigest()[:16]
-        index._index_path = f"{self._index_path}.{digest}"
+        index._index_path = f"{self._index_path}.{sources.closure_digest(roots)}"
         return index
 
     def _data_name(self, number):
@@ -295,6 +300,8 @@ class CacheIndex(IndexDataCacheFile):
     def _read(self, path: str):
         """The content of a file. Raises OSError, or UnreadableError if this process lacks a type in it."""
         with open(path, "rb") as file:
+            with contextlib.suppress(OSError):
+                os.utime(path)  # it is in use
             if reason := untrusted_reason(os.fstat(file.fileno())):
                 message = f"compiled code in {Path(path).parent} is not used, as a file in it {reason}"
                 _warn_once(message)
@@ -311,26 +318,25 @@ class CacheIndex(IndexDataCacheFile):
             raise UnreadableError(str(error)) from None
 
 
-def _outside_modules(kind) -> Iterator[str]:
-    """Modules outside the package that define named tuples in a Numba type."""
+def _classes_in(kind) -> Iterator[type]:
+    """The classes of named tuples in a Numba type."""
     if isinstance(kind, tuple):
         inner = kind
     elif isinstance(kind, types.BaseTuple):
         inner = kind.types
-        module = getattr(getattr(kind, "instance_class", tuple), "__module__", "builtins")
-        if not _is_of_package(module):
-            yield module
-    else:  # types of `compile.code`: `CodeType`, `TaskArguments`
+        if isinstance(kind, types.BaseNamedTuple):
+            yield kind.instance_class
+    else:  # types of `compile`: `CodeType`, `TaskArguments`, `Record`
         inner = (*getattr(kind, "task_types", ()), *([kind.content] if hasattr(kind, "content") else ()))
     for part in inner:
-        yield from _outside_modules(part)
+        yield from _classes_in(part)
 
 
 @functools.cache
 def _is_of_package(module: str) -> bool:
     """Whether every process has a module: its file lies in the package. Its name alone does not show that."""
     file = getattr(sys.modules.get(module), "__file__", None)
-    return module == "builtins" or (file is not None and Path(file).is_relative_to(PACKAGE))
+    return module == "builtins" or (file is not None and Path(file).is_relative_to(sources.PACKAGE))
 
 
 class KernelCache(FunctionCache):
@@ -368,8 +374,19 @@ def open_cache(function: Callable) -> FunctionCache | NullCache:
             numba.config.CACHE_DIR = before
     if not Path(found.cache_path).is_relative_to(folder):
         return NullCache()
-    found.__class__, found._cache_file.__class__ = KernelCache, CacheIndex
+    found.__class__ = KernelCache
+    found._cache_file = _index_of(function, found)
     return found
+
+
+def _index_of(function: Callable, opened: FunctionCache) -> CacheIndex:
+    """The index of a function. Of one of the package its definitions decide, not the line, time and size of a file."""
+    name, stamp = opened._impl.filename_base, opened._cache_file._source_stamp
+    if _is_of_package(function.__module__) and "<locals>" not in function.__qualname__:
+        name, stamp = re.sub(r"-\d+\.py", ".py", name), ""
+    index = CacheIndex(opened.cache_path, name, stamp)
+    index.function = function
+    return index
 
 
 def _make_subfolder(folder: str, function: Callable) -> bool:

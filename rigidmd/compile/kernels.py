@@ -30,6 +30,7 @@ from numba.extending import overload
 
 from rigidmd.compile.cache import open_cache
 from rigidmd.compile.records import Record
+from rigidmd.compile.sources import register_implementation
 
 #: Error that compiling a user's function may raise.
 CompileError = NumbaError
@@ -62,22 +63,27 @@ def kernel(
     return compiled
 
 
-def implements(stub: Callable, kinds: type | tuple[type, ...] = (), **options: bool) -> Any:
+def implements(stub: Callable, kinds: type | tuple[type, ...] = (), *, chooses: bool = False, **options: bool) -> Any:
     """`numba.extending.overload` with the options of `kernel`: an overload does not inherit those of its caller.
 
     kinds : NamedTuple classes; the function implements `stub` if its first argument is of one of these. Without them
         the function is called with the types of the arguments, and returns an implementation for them, or None
+    chooses : for classes, that the function is called with the types too
     options : `inline` and `count_references` as for `kernel`, and others of `overload`
     """
     compiled_with = {name: options.pop(name) for name in ("inline", "count_references") if name in options}
     register = overload(stub, jit_options=compiler_options(**compiled_with) | LINKED_OPTIONS, **options)
-    if not kinds:
-        return register
     classes = kinds if isinstance(kinds, tuple) else (kinds,)
 
     def register_for_kinds(function):
+        register_implementation(stub, classes, function)
+        if not classes:
+            return register(function)
+
         def choose(*given):
-            return function if any(is_a(given[0], one) for one in classes) else None
+            if not any(is_a(given[0], one) for one in classes):
+                return None
+            return function(*given) if chooses else function
 
         choose.__signature__ = inspect.signature(function)  # pyright: ignore[reportFunctionMemberAccess]
         register(choose)

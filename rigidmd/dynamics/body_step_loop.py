@@ -3,7 +3,7 @@
 # isort: skip_file
 from typing import NamedTuple
 
-from rigidmd.compile import implements, is_a, kernel
+from rigidmd.compile import implements, kernel
 from rigidmd.core.state import NOW, WORK
 from rigidmd.dynamics.force_gradient import add_gyration, displace
 from rigidmd.dynamics.step_loop import accumulate_work, drift, kick
@@ -59,10 +59,8 @@ def _add_gyration_of_body(model, load, tau, gain):
         gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
 
 
-@implements(accumulate_work, inline=True)
+@implements(accumulate_work, Body, chooses=True, inline=True)
 def _accumulate_work_of_body(model, terms, state, h):
-    if not is_a(model, Body):
-        return None
     if not any(getattr(term.instance_class, "time_dependent", False) for term in terms.types):
         return lambda model, terms, state, h: None
 

@@ -8,6 +8,7 @@ cpus (their numbers), timestep_fs, steps, every (steps between looks at the ener
 workload (cut-off and so on), sites (file of the start) and, for rigidmd, its scene.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -72,16 +73,15 @@ class Rigidmd:
 
     @staticmethod
     def version() -> str:
-        sys.path.insert(0, str(Path(__file__).parents[1]))
-        from support import source_digest
-
         import rigidmd
+        from rigidmd.compile.sources import PACKAGE
 
-        return f"rigidmd {rigidmd.__version__} (sources {source_digest()[:8]})"
+        paths = sorted(PACKAGE.rglob("*.py"))
+        digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+        return f"rigidmd {rigidmd.__version__} (sources {digest[:8]})"
 
     @staticmethod
     def run(job: dict, sites: dict, folder: Path) -> dict:
-        sys.path.insert(0, str(Path(__file__).parents[1]))
         from support import SCHEMES, observe
 
         from rigidmd import Scene, Simulation

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidmd.compile.cache import PACKAGE
+from rigidmd.compile.sources import PACKAGE
 from rigidmd.core.state import HEAT, TALLY_SIZE, State, no_load
 from rigidmd.dynamics.user_kernels import FORCES, THERMOSTATS, with_checked_indices
 from rigidmd.engines.cpu.engine import CompileError

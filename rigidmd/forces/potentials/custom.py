@@ -74,10 +74,8 @@ def _pair_of_one_kind(potential, i, j, r2):
     return energy_and_force(potential, potential.formula, potential.terms, r2)
 
 
-@implements(pairs.pair, inline=True)
+@implements(pairs.pair, CustomManyKinds, chooses=True, inline=True)
 def _pair(potential, i, j, r2):
-    if not is_a(potential, CustomManyKinds):
-        return None
     types = dict(zip(CustomManyKinds._fields, potential.types, strict=True))
     formula, truncation = types["formula"].instance_class, types["truncation"]
     names = [f"load(potential.table, at + {5 + p} * potential.stride)" for p in range(len(formula._fields))]
