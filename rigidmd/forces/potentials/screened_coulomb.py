@@ -26,9 +26,11 @@ from rigidmd.units import COULOMB_CHARGE
 #: Largest error of a polynomial, relative to the function at r = 0, by precision: below the rounding error of its
 #: evaluation, 5e-15 and 1.5e-7 for alpha times the cutoff up to 4.
 FIT_ERROR = {np.dtype(np.float64): 1e-15, np.dtype(np.float32): 3e-8}
-#: Numbers of terms of the energy and of the force are multiples of these, because each number compiles other code. The
-#: force, which most calls compute, has the finer step: at most three terms more than it needs.
-ENERGY_STEP, FORCE_STEP = 8, 4
+#: Numbers of terms of the energy and of the force, by precision, because each number compiles other code: enough for
+#: alpha times the cutoff up to 3.1. Beyond, it grows by STEP.
+TERMS_OF_ENERGY = {np.dtype(np.float64): 24, np.dtype(np.float32): 16}
+TERMS_OF_FORCE = {np.dtype(np.float64): 24, np.dtype(np.float32): 12}
+STEP = 8
 #: Intervals of a table, and coefficients of each.
 INTERVALS, TERMS = 32, 4
 #: Largest error of a table, relative like FIT_ERROR: the rounding error of the polynomial that it replaces.
@@ -49,9 +51,9 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
     charges is below `error` (1/Å²)."""
     kind = np.dtype(dtype)
     strength = 2 / sqrt(pi) * alpha
-    energy = _cut(_series(alpha * cutoff, 0), 0.0, kind, ENERGY_STEP)
+    energy = _cut(_series(alpha * cutoff, 0), 0.0, kind, TERMS_OF_ENERGY[kind])
     of_unit = strength * 2 * alpha**2 * cutoff  # 0 without screening
-    force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind, FORCE_STEP)
+    force = _cut(_series(alpha * cutoff, 2), error / of_unit if of_unit else 0.0, kind, TERMS_OF_FORCE[kind])
     energy, force = strength * energy, strength * 2 * alpha**2 * force
     return Screening(kind.type(2 / cutoff**2), tuple(map(kind.type, energy)), tuple(map(kind.type, force)))
 
@@ -59,8 +61,8 @@ def screening(alpha: float, cutoff: float, dtype: type = np.float64, error: floa
 def dispersion_screening(beta: float, cutoff: float, dtype: type = np.float64) -> Screening:
     """As `screening`, for (1 - g(beta r))/r⁶ of `lennard_jones.ScreenedDispersion`, 1/Å⁶, and its force over r."""
     kind = np.dtype(dtype)
-    energy = beta**6 * _cut(_series(beta * cutoff, 5), 0.0, kind, ENERGY_STEP)
-    force = 2 * beta**8 * _cut(_series(beta * cutoff, 7), 0.0, kind, FORCE_STEP)
+    energy = beta**6 * _cut(_series(beta * cutoff, 5), 0.0, kind, TERMS_OF_ENERGY[kind])
+    force = 2 * beta**8 * _cut(_series(beta * cutoff, 7), 0.0, kind, TERMS_OF_FORCE[kind])
     return Screening(kind.type(2 / cutoff**2), tuple(map(kind.type, energy)), tuple(map(kind.type, force)))
 
 
@@ -112,11 +114,13 @@ def force_table(alpha: float, cutoff: float) -> tuple[np.float32, np.ndarray, fl
     return density, table, float(off.max())
 
 
-def _cut(series: np.ndarray, error: float, kind: np.dtype, step: int) -> np.ndarray:
-    """Coefficients of powers of t for a Chebyshev series, truncated at an error to a multiple of `step` terms."""
+def _cut(series: np.ndarray, error: float, kind: np.dtype, terms: int) -> np.ndarray:
+    """Coefficients of powers of t for a Chebyshev series, truncated at an error to a number of terms, or STEP more."""
     left = np.cumsum(np.abs(series[::-1]))[::-1]
     needed = int(np.sum(left > max(error, FIT_ERROR[kind] * left[0])))
-    return np.polynomial.chebyshev.cheb2poly(series[: -(-max(needed, 1) // step) * step])
+    count = terms + max(0, -(-(needed - terms) // STEP)) * STEP
+    powers = np.polynomial.chebyshev.cheb2poly(series[:count])
+    return np.pad(powers, (0, count - len(powers)))
 
 
 def _series(x: float, power: int) -> np.ndarray:

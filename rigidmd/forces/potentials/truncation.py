@@ -101,8 +101,9 @@ class SwitchCorrection(NamedTuple):
 
 #: Instead of a `SwitchTerm` or `SwitchCorrection`, for other truncations.
 NO_SWITCH = ()
-#: The error of a `SwitchCorrection`, relative to its largest value, and its largest number of coefficients.
-CORRECTION_ERROR, MAX_COEFFICIENTS = 2e-7, 18
+#: The error of a `SwitchCorrection`, relative to its largest value, and its numbers of coefficients: each compiles
+#: other code, and the first is enough for a switch over the last sixth of the cutoff.
+CORRECTION_ERROR, COEFFICIENTS = 2e-7, (12, 18)
 
 
 def switch_term_of(truncation: Truncation, powers: dict[int, float], dtype: type) -> SwitchTerm | tuple[()]:
@@ -140,13 +141,15 @@ def switch_correction_of(truncation: Truncation, powers: dict[int, float], dtype
 
     x = np.linspace(-1, 1, 200)
     with np.errstate(all="ignore"):  # a switch that starts near 0 is too wide
-        found = chebyshev.chebinterpolate(over_square, 2 * MAX_COEFFICIENTS)
+        found = chebyshev.chebinterpolate(over_square, 2 * COEFFICIENTS[-1])
         largest = np.abs((x + 1) ** 2 * over_square(x)).max()
     left_out = 4 * np.abs(found[::-1]).cumsum()[::-1]  # at most, without this coefficient and those after it
-    count = int(np.argmax(left_out < CORRECTION_ERROR * largest))
-    if not 0 < count <= MAX_COEFFICIENTS:
+    needed = int(np.argmax(left_out < CORRECTION_ERROR * largest))
+    counts = [count for count in COEFFICIENTS if 0 < needed <= count]
+    if not counts:
         return NO_SWITCH
-    return SwitchCorrection(tuple(chebyshev.cheb2poly(found[:count]).tolist()))
+    powers = chebyshev.cheb2poly(found[: counts[0]])
+    return SwitchCorrection(tuple(np.pad(powers, (0, counts[0] - len(powers))).tolist()))
 
 
 @chosen_by_type(inline=True)
