@@ -114,6 +114,18 @@ def task(*, count_references=True):
     return lambda function: CompiledTask(function, **compiler_options(count_references=count_references))
 
 
+def addresses_of(pairs: Sequence[tuple[CompiledTask, TaskArguments]]) -> np.ndarray:
+    """Addresses (n,) of the machine code of tasks for types of arguments, which is compiled or read from the cache.
+
+    While tasks are only collected (`compile_together`), the addresses are 0.
+    """
+    collected = _collected.get()
+    if collected is not None:
+        collected.extend(pairs)
+        return np.zeros(len(pairs), np.intp)
+    return np.array([one.address(kind) for one, kind in pairs], np.intp)
+
+
 class Code:
     """Machine code of named tasks, each for arguments of one type; `call` and `call_blocks` check that type.
 
@@ -122,11 +134,7 @@ class Code:
 
     def __init__(self, **tasks: tuple[CompiledTask, object]):
         kinds = {name: TaskArguments(numba.typeof(content)) for name, (_, content) in tasks.items()}
-        pairs = [(tasks[name][0], kind) for name, kind in kinds.items()]
-        collected = _collected.get()
-        if collected is not None:
-            collected.extend(pairs)
-        self._addresses = np.array([one.address(kind) if collected is None else 0 for one, kind in pairs], np.uintp)
+        self._addresses = addresses_of([(tasks[name][0], kind) for name, kind in kinds.items()])
         self.address_value = self._addresses.ctypes.data
         self.numba_type = CodeType(tuple(kinds.items()))
         self._names = list(tasks)

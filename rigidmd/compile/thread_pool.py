@@ -229,17 +229,23 @@ def _poll(pool, count):
 
 @intrinsic
 def run_on_all_threads(typing, address, task_arguments, blocks):
-    """Call the task at an address for every block, on all threads. `start_workers` must have been called."""
+    """Call the task at an address for every block, on all threads; `task_arguments` as for `call_address`.
+
+    `start_workers` must have been called.
+    """
 
     def emit(context, builder, signature, arguments):
         memory = builder.module.globals.get(SYMBOL) or ir.GlobalVariable(builder.module, INT64, SYMBOL)
         kind = ir.FunctionType(ir.VoidType(), [INT64] * 4)
         run_task = function_at(builder, builder.load(memory, typ=INT64), kind)
-        content = builder.ptrtoint(arguments[1], INT64)
+        content = arguments[1]
+        if not isinstance(content.type, ir.IntType):
+            content = builder.ptrtoint(content, INT64)
         builder.call(run_task, [builder.ptrtoint(memory, INT64), arguments[0], content, arguments[2]])
         return context.get_dummy_value()
 
-    return types.void(types.intp, task_arguments, types.intp), emit
+    content = types.intp if isinstance(task_arguments, types.Integer) else task_arguments
+    return types.void(types.intp, content, types.intp), emit
 
 
 class _ThreadPool:

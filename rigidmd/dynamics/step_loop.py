@@ -21,7 +21,7 @@ from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
 from rigidmd.dynamics.thermostats import apply_thermostat, thermostat_code
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
-from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, has_time_dependent_terms, total_energy_rate
+from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, total_energy_rate
 from rigidmd.mechanics.batches import LANES, kick_group, rotate_group
 from rigidmd.mechanics.free_rotor import restore_orthogonality, rotate_by_vector
 
@@ -318,8 +318,6 @@ def accumulate_work(model, terms, state, h):
     energy changes at fixed positions."""
     if not is_a(model, Model):
         return None
-    if not has_time_dependent_terms(terms):
-        return lambda model, terms, state, h: None
 
     def accumulate_work_of_molecules(model, terms, state, h):
         state.energy_ledger[WORK] += h * total_energy_rate(terms)

@@ -11,11 +11,21 @@ potential one with an `@implements(pair_loop.pair)`.
 from typing import NamedTuple
 
 import numpy as np
-from numba import literal_unroll, types
+from numba import literal_unroll
 
 from rigidmd.compile import (
-    Code, NumbaStruct, call_address, chosen_by_type, implements, is_a, kernel, load_arguments, task,
-)  # fmt: skip
+    ALWAYS,
+    Pass,
+    Program,
+    Rows,
+    chosen_by_type,
+    implements,
+    is_a,
+    kernel,
+    load_arguments,
+    run_passes,
+    task,
+)
 from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
 
 
@@ -25,7 +35,6 @@ class Setup(NamedTuple):
     cell: np.ndarray  # (3, 3) at the start; later the cell of the state is used
     dtype: type  # of the arithmetic between sites: numpy.float64 or numpy.float32
     skin: float  # extra radius of neighbour lists, Å
-    with_energies: np.ndarray  # (1,) of the table
     needs_virials: bool  # whether virials will be needed without energies
 
 
@@ -102,81 +111,104 @@ def _add_no_force(term, state, load, tally):
     return OK
 
 
-#: What `compute_load` computes: forces; forces, energies and virials; forces into the other load; forces and virials,
+#: What `compute_load` computes, and when passes of terms act: forces; forces, energies and virials; forces and virials,
 #: and energies only where these take no extra time.
-FORCES_ONLY, WITH_ENERGIES, INTO_OTHER_LOAD, WITH_VIRIALS = 0, 1, 2, 3
+FORCES_ONLY, WITH_ENERGIES, WITH_VIRIALS = 1, 2, 4
+TALLIED = WITH_ENERGIES | WITH_VIRIALS
+#: For `compute_load`: forces into the other load.
+INTO_OTHER_LOAD = 8
 
 
-class TermTable(NamedTuple):
-    """Force terms as addresses of machine code and of its arguments. Each term is compiled once, for all scenes that
-    have it, and the step loop once for all terms of molecules. The table counts no references: see `TermDispatcher`."""
+class Evaluation(NamedTuple):
+    """What the passes of a term read and write."""
 
-    force_address: np.ndarray  # (terms,) intp, of `_add_plain`; 0 for a body, whose terms are compiled into the loop
-    tally_address: np.ndarray  # (terms,) of `_add_tallied`
-    rate_address: np.ndarray | None  # (terms,) of `_add_rate`; None if no term is time-dependent
-    arguments_address: np.ndarray  # (terms,) of the packed arguments
-    tallies: np.ndarray  # (terms, 10) energies and virials
-    with_energies: np.ndarray  # (1,) whether energies are needed in `tallies`
-    tallies_valid: np.ndarray  # (1,) whether `tallies` belong to the last forces
-    status: np.ndarray  # (1,) the worst status code
-    power: np.ndarray  # (1,) sum of the rates
+    state: State
+    load: Load
+    tally: np.ndarray  # (10,) of the term
+    status: np.ndarray  # (1,) of the program
+
+
+def passes_of(workspace: NamedTuple, into: Evaluation) -> list[Pass]:
+    """The passes of a term: those that it has, or one that calls `add_forces`."""
+    if hasattr(workspace, "passes"):
+        return workspace.passes(into)
+    state, load, tally, status = into
+    return [
+        Pass(_add_plain, (workspace, state, load, status), when=FORCES_ONLY),
+        Pass(_add_tallied, (workspace, state, load, tally, status), when=TALLIED),
+    ]
 
 
 @task()
 def _add_plain(arguments, block):
-    term, state, load, other, _, status, _ = load_arguments(arguments)
-    status[0] = worse_status(status[0], add_forces(term, state, other if block == INTO_OTHER_LOAD else load, None))
+    term, state, load, status = load_arguments(arguments)
+    status[0] = worse_status(status[0], add_forces(term, state, load, None))
 
 
 @task()
 def _add_tallied(arguments, block):
-    term, state, load, _, tally, status, _ = load_arguments(arguments)
+    term, state, load, tally, status = load_arguments(arguments)
     status[0] = worse_status(status[0], add_forces(term, state, load, tally))
 
 
 @task()
 def _add_rate(arguments, block):
-    term, state, _, _, _, _, power = load_arguments(arguments)
+    term, state, power = load_arguments(arguments)
     power[0] += energy_rate(term, state)
 
 
-class TermDispatcher:
-    """The terms of an engine and their table; keeps alive what the table refers to. called : whether the step loop
-    calls the terms by address. with_energies : see `Setup`"""
+class TermTable(NamedTuple):
+    """The passes of all terms, and what they compute. Its type is the same for all terms."""
 
-    def __init__(self, workspaces: tuple[NamedTuple, ...], called: bool, with_energies: np.ndarray):
-        tasks = {"tallied": _add_tallied} | ({"plain": _add_plain} if called else {})
-        if called and any(getattr(type(workspace), "time_dependent", False) for workspace in workspaces):
-            tasks["rate"] = _add_rate
-        plain, tallied, rate, arguments = np.zeros((4, len(workspaces)), np.intp)
-        tallies, (valid, status) = np.zeros((len(workspaces), TALLY_SIZE)), np.zeros((2, 1), np.int64)
-        rates, power = rate if "rate" in tasks else None, np.zeros(1)
-        self.table = TermTable(plain, tallied, rates, arguments, tallies, with_energies, valid, status, power)
-        self._codes: list[Code] = []
-        self._structs: list[NumbaStruct] = []
+    rows: Rows
+    elsewhere: np.ndarray  # (rows,) addresses of the arguments with the other load
+    rates: Rows  # of time-dependent terms, which add to `power`
+    tallies: np.ndarray  # (terms, 10) energies and virials
+    tallies_valid: np.ndarray  # (1,) whether `tallies` belong to the last forces
+    power: np.ndarray  # (1,) sum of the rates
+
+
+class TermDispatcher:
+    """The terms of an engine and their table.
+
+    uses : bits of what is computed, see FORCES_ONLY
+    with_rates : whether the work of time-dependent terms is needed
+    """
+
+    def __init__(self, workspaces: tuple[NamedTuple, ...], uses: int, with_rates: bool = False):
+        self._tallies, self._power = np.zeros((len(workspaces), TALLY_SIZE)), np.zeros(1)
+        self._status, valid = np.zeros((2, 1), np.int64)
+        self._with_rates = with_rates
+        self._program = Program(self._passes(workspaces, *EXAMPLE), uses, self._status)
+        self._rates = Program(self._rate_passes(workspaces, EXAMPLE[0]), ALWAYS, np.zeros(1, np.int64))
+        rows = self._program.rows
+        elsewhere = np.zeros_like(rows.arguments)
+        self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
         self._bound_to: tuple = ()
-        for k, workspace in enumerate(workspaces):
-            content = (workspace, *EXAMPLE, EXAMPLE[1], tallies[0], status, power)
-            self._codes.append(Code(**{name: (task, content) for name, task in tasks.items()}))
-            for name, addresses in (("plain", plain), ("tallied", tallied), ("rate", rate)):
-                addresses[k] = self._codes[k].address(name) if name in tasks else 0
+
+    def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
+        found: list[Pass] = []
+        for workspace, tally in zip(workspaces, self._tallies, strict=True):
+            found += passes_of(workspace, Evaluation(state, load, tally, self._status))
+        return found
+
+    def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
+        dependent = [w for w in workspaces if getattr(type(w), "time_dependent", False)]
+        return [Pass(_add_rate, (w, state, self._power)) for w in dependent if self._with_rates]
 
     def bind(
         self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None
     ) -> TermTable:
         """The table, bound to workspaces (of the same types as the first), a state and its loads. Numba takes
         milliseconds to determine the types of the arrays, so nothing is done if these are unchanged."""
-        table, loads = self.table, (load, other or load)
-        bound_to = (*workspaces, *state, *loads[0], *loads[1])
-        if list(map(id, bound_to)) == list(map(id, self._bound_to)):
-            return table
-        self._structs = [
-            code.to_struct((workspace, state, *loads, table.tallies[k], table.status, table.power))
-            for k, (workspace, code) in enumerate(zip(workspaces, self._codes, strict=True))
-        ]
-        table.arguments_address[:] = [struct.address for struct in self._structs]
-        self._bound_to = bound_to
-        return table
+        bound_to = (*workspaces, *state, *load, *(other or ()))
+        if list(map(id, bound_to)) != list(map(id, self._bound_to)):
+            self._program.bind(self._passes(workspaces, state, load))
+            self._rates.bind(self._rate_passes(workspaces, state))
+            if other is not None:
+                self._program.bind(self._passes(workspaces, state, other), self.table.elsewhere)
+            self._bound_to = bound_to
+        return self.table
 
 
 @kernel(from_python=True)
@@ -184,11 +216,6 @@ def compute_load_with_energies(table, force, torque_body):
     """Write forces and torques of all terms, and energies and virials into the table; a status code. force, torque_body
     : the arrays of the load to which the table is bound"""
     return compute_load(table, None, Load(force, torque_body), WITH_ENERGIES)
-
-
-def has_time_dependent_terms(table: types.Type) -> bool:
-    """Whether the type of a table has addresses of the rates of time-dependent terms."""
-    return is_a(table, TermTable) and table.types[TermTable._fields.index("rate_address")] is not types.none
 
 
 @chosen_by_type
@@ -199,24 +226,19 @@ def compute_load(terms, state, load, which):
     if not is_a(terms, TermTable):
         return lambda terms, state, load, which: compute_body_load(terms, state, load)
 
-    def load_by_address(terms, state, load, which):
+    def load_by_passes(terms, state, load, which):
         clear(load.force)
         clear(load.torque_body)
-        terms.status[0] = OK
         terms.tallies_valid[0] = 0
-        tallied = which in (WITH_ENERGIES, WITH_VIRIALS)
-        if tallied:
+        if which & TALLIED != 0:
             terms.tallies[:] = 0.0
-            terms.with_energies[0] = which == WITH_ENERGIES
-        for k in range(len(terms.arguments_address)):
-            address = terms.tally_address[k] if tallied else terms.force_address[k]
-            call_address(address, terms.arguments_address[k], which)
-            if terms.status[0] != OK:  # the next call begins with the first term again
-                return terms.status[0]
-        terms.tallies_valid[0] = which == WITH_ENERGIES
-        return OK
+        if which == INTO_OTHER_LOAD:
+            return run_passes(terms.rows, terms.elsewhere, FORCES_ONLY)
+        status = run_passes(terms.rows, terms.rows.arguments, which)
+        terms.tallies_valid[0] = which == WITH_ENERGIES and status == OK
+        return status
 
-    return load_by_address
+    return load_by_passes
 
 
 @kernel
@@ -256,6 +278,5 @@ def total_power(terms, state, velocity, omega):
 @kernel
 def total_energy_rate(table):
     table.power[0] = 0.0
-    for k in range(len(table.arguments_address)):
-        call_address(table.rate_address[k], table.arguments_address[k], FORCES_ONLY)
+    run_passes(table.rates, table.rates.arguments, ALWAYS)
     return table.power[0]

@@ -29,9 +29,20 @@ from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import LennardJonesWalls
 from rigidmd.forces.terms import (
-    NoForce, Setup, TermDispatcher, checkpoint_arrays, compute_load_with_energies, restored, with_capacity, with_code,
-    with_common_scratch, workspace_of,
-)  # fmt: skip
+    FORCES_ONLY,
+    TALLIED,
+    WITH_ENERGIES,
+    NoForce,
+    Setup,
+    TermDispatcher,
+    checkpoint_arrays,
+    compute_load_with_energies,
+    restored,
+    with_capacity,
+    with_code,
+    with_common_scratch,
+    workspace_of,
+)
 from rigidmd.mechanics.free_rotor import NO_SYMMETRY, ExactRotor, SplitRotor
 
 __all__ = ["BehindWallError", "CompileError", "CpuEngine", "Precision"]
@@ -42,6 +53,8 @@ LOAD, BOX, TRAJECTORY = "load", "box", "trajectory"
 BOX_FIELDS = ("tally", "known", "counts")
 TRAJECTORY_FIELDS = ("energies", "known", "sums")
 
+#: When the passes of terms act, by what the engine uses them for.
+USES = {"steps": FORCES_ONLY | TALLIED, "observations": WITH_ENERGIES}
 #: dt, `until` and `observed` of `Engine.advance`.
 Steps = tuple[float, int, bool]
 DTYPES = {"double": np.float64, "mixed": np.float32}
@@ -68,7 +81,7 @@ class CpuEngine(Engine):
         python_forces: dict[str, Callable] | None = None, threads: int | None = None, needs_virials: bool = False
     ):  # fmt: skip
         self.model, self.terms, self.names = model, terms, list(terms)
-        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, np.ones(1, np.int64), needs_virials)
+        self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, needs_virials)
         self._python_forces = python_forces or {}
         self.threads = threads
         self._workspaces: tuple[NamedTuple, ...] | None = None
@@ -163,8 +176,7 @@ class CpuEngine(Engine):
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
-            molecular = isinstance(self.model, Model)
-            self._dispatchers[use] = TermDispatcher(workspaces, molecular, self._setup.with_energies)
+            self._dispatchers[use] = TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
         return self._dispatchers[use]
 
     def model_for(self, scheme: Scheme) -> Model | Body:
@@ -312,7 +324,7 @@ class CpuEngine(Engine):
     def _compile(self, spaces: tuple[NamedTuple, ...]) -> None:
         """Compile all code for molecules that does not depend on a thermostat or a barostat."""
         workspaces = tuple(with_code(workspace) for workspace in spaces)
-        TermDispatcher(workspaces, True, self._setup.with_energies)
+        TermDispatcher(workspaces, USES["steps"], with_rates=True)
         molecule_code(self.model, NoThermostat())
 
     def _handle_status(self, status: int, state: State) -> tuple[NamedTuple, ...]:

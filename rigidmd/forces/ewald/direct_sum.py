@@ -12,16 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import BLOCKS, Code, call_blocks, implements, kernel, load_arguments, pack_arguments, task
+from rigidmd.compile import BLOCKS, Pass, kernel, load_arguments, task
 from rigidmd.compile.simd import broadcast, lane_count, lanes_of, load, store, sum_lanes
-from rigidmd.core.state import OK, TALLY_SIZE
-from rigidmd.forces import terms
+from rigidmd.core.state import TALLY_SIZE
 from rigidmd.forces.ewald.smooth import InverseR, Smooth, slope, strength_times_square
-from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
-)  # fmt: skip
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_passes, position_pass, virial_buffer
 from rigidmd.forces.neighbors.space import follow_cell
-from rigidmd.forces.terms import Setup
+from rigidmd.forces.terms import Evaluation, Setup
 
 SAME_BASIS = np.eye(3, dtype=int)  #: of a cell whose edges are those of its description
 
@@ -147,20 +144,24 @@ class EwaldWorkspace(NamedTuple):
     sites: BodySites | CentralSites
     k_vectors: KVectors
     sums: KSpaceSums
-    code: Code | None = None
 
     @property
     def site_force(self) -> np.ndarray:
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
         return self.sums.force
 
-    def with_code(self) -> "EwaldWorkspace":
+    def passes(self, into: Evaluation) -> list[Pass]:
+        """Positions; strengths, if the cell has changed; phases, structure factors, and forces."""
         sums, content = self.sums, (self.smooth, self.k_vectors, self.sums)
-        code = Code(
-            phases=(_compute_phases, content), sum=(_sum_structure_factors, content), forces=(_compute_forces, content),
-            **position_task(self.sites, sums.position), **load_tasks(self.sites, sums.force, sums.virial),
-        )  # fmt: skip
-        return self._replace(code=code)
+        blocks = len(sums.tallies)
+        return [
+            position_pass(self.sites, into.state, sums.position),
+            Pass(_follow_cell, (*content, into.state)),
+            Pass(_compute_phases, content, blocks),
+            Pass(_sum_structure_factors, content, blocks),
+            Pass(_compute_forces, content, blocks),
+            *load_passes(self.sites, into, sums.force, sums),
+        ]
 
 
 @kernel
@@ -179,20 +180,13 @@ def invert_cell(cell, reciprocal):
     return volume
 
 
-@implements(terms.add_forces, EwaldWorkspace, count_references=False)
-def _add_ewald_sum(term, state, load, tally):
-    code, sums = term.code, term.sums
-    call_blocks(code, "positions", pack_arguments((term.sites, state, sums.position)), blocks_of(len(state.position)))
+@task()
+def _follow_cell(arguments, block):
+    """Set the strengths of the k-vectors, if the cell has changed."""
+    smooth, k_vectors, sums, state = load_arguments(arguments)
     if follow_cell(state.cell, sums.cell):
         volume = abs(invert_cell(sums.cell, sums.reciprocal))
-        _set_strengths(term.k_vectors, sums, term.smooth, volume)
-    arguments = pack_arguments((term.smooth, term.k_vectors, sums))
-    blocks = len(sums.tallies)
-    call_blocks(code, "phases", arguments, blocks)
-    call_blocks(code, "sum", arguments, blocks)
-    call_blocks(code, "forces", arguments, blocks)
-    load_from_blocks(term.sites, code, state, load, sums.force, sums, tally)
-    return OK
+        _set_strengths(k_vectors, sums, smooth, volume)
 
 
 @kernel

@@ -16,20 +16,25 @@ from rocket_fft import c2c, c2r, r2c
 from scipy.interpolate import BSpline
 
 from rigidmd.compile import (
-    BLOCKS, MOST_BLOCKS, Code, call, call_blocks, chosen_by_type, implements, kernel, load_arguments, pack_arguments,
+    BLOCKS,
+    MOST_BLOCKS,
+    Code,
+    Pass,
+    call_blocks,
+    chosen_by_type,
+    kernel,
+    load_arguments,
+    pack_arguments,
     task,
-)  # fmt: skip
+)
 from rigidmd.compile.simd import load_eight, load_four, store, sum_lanes
-from rigidmd.core.state import NOT_FINITE, OK, TALLY_SIZE
-from rigidmd.forces import terms
+from rigidmd.core.state import NOT_FINITE, TALLY_SIZE
 from rigidmd.forces.ewald.direct_sum import add_k_vector, invert_cell
 from rigidmd.forces.ewald.errors import aliases
 from rigidmd.forces.ewald.smooth import InverseR, Smooth, strength_times_square
-from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, blocks_of, load_from_blocks, load_tasks, position_task, virial_buffer,
-)  # fmt: skip
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, load_passes, position_pass, virial_buffer
 from rigidmd.forces.neighbors.space import follow_cell
-from rigidmd.forces.terms import Setup
+from rigidmd.forces.terms import FORCES_ONLY, TALLIED, Evaluation, Setup
 
 PLANES = 16  # of a block, if there are more blocks than the minimum
 SERIAL_POINTS = 16**3  # up to this number of grid points there is one block, on the main thread
@@ -129,41 +134,38 @@ class PmeWorkspace(NamedTuple):
         """Forces (s, 3) on its sites as last evaluated, lab frame, u Å/ps²."""
         return self.mesh.force
 
+    @property
+    def _content(self) -> tuple:
+        return self.smooth, self.charge, self.spline, self.mesh
+
     def with_code(self) -> "PmeWorkspace":
-        mesh, content = self.mesh, (self.smooth, self.charge, self.spline, self.mesh)
-        code = Code(
-            influence=(_set_influence, content), scale=(_scale_positions, content), sort=(_sort_sites, content),
-            spread=(_spread_charges, content), convolve=(_convolve, (self.smooth, mesh, None)),
-            convolve_with_virial=(_convolve, (self.smooth, mesh, mesh.tallies)), back=(_transform_back, content),
-            forces=(_interpolate_forces, content), **position_task(self.sites, mesh.position),
-            **load_tasks(self.sites, mesh.force, mesh.virial),
-        )  # fmt: skip
-        return self._replace(code=code)
+        return self._replace(code=Code(influence=(_set_influence, self._content)))
+
+    def passes(self, into: Evaluation) -> list[Pass]:
+        """Positions; the influence function, if the cell has changed; charges on the grid, and the forces."""
+        mesh, content = self.mesh, self._content
+        blocks = len(mesh.tallies)
+        return [
+            position_pass(self.sites, into.state, mesh.position),
+            Pass(_follow_cell, (self.code, *content, into.state)),
+            Pass(_scale_positions, content, blocks),
+            Pass(_sort_sites, (*content, into.status)),
+            Pass(_spread_charges, content, blocks),
+            Pass(_convolve, (self.smooth, mesh, None), blocks, FORCES_ONLY),
+            Pass(_convolve, (self.smooth, mesh, mesh.tallies), blocks, TALLIED),
+            Pass(_transform_back, content, blocks),
+            Pass(_interpolate_forces, content, blocks),
+            *load_passes(self.sites, into, mesh.force, mesh),
+        ]
 
 
-@implements(terms.add_forces, PmeWorkspace, count_references=False)
-def _add_pme(term, state, load, tally):
-    code, mesh = term.code, term.mesh
-    blocks = len(mesh.tallies)
-    arguments = pack_arguments((term.smooth, term.charge, term.spline, mesh))
-    call_blocks(code, "positions", pack_arguments((term.sites, state, mesh.position)), blocks_of(len(state.position)))
+@task(count_references=False)
+def _follow_cell(arguments, block):
+    """Set the influence function, if the cell has changed."""
+    code, smooth, charge, spline, mesh, state = load_arguments(arguments)
     if follow_cell(state.cell, mesh.cell):
         invert_cell(mesh.cell, mesh.reciprocal)
-        call_blocks(code, "influence", arguments, blocks)
-    call_blocks(code, "scale", arguments, blocks)
-    for block in range(blocks):
-        if mesh.not_finite[block]:
-            return NOT_FINITE
-    call(code, "sort", arguments)
-    call_blocks(code, "spread", arguments, blocks)
-    if tally is None:
-        call_blocks(code, "convolve", pack_arguments((term.smooth, mesh, None)), blocks)
-    else:
-        call_blocks(code, "convolve_with_virial", pack_arguments((term.smooth, mesh, mesh.tallies)), blocks)
-    call_blocks(code, "back", arguments, blocks)
-    call_blocks(code, "forces", arguments, blocks)
-    load_from_blocks(term.sites, code, state, load, mesh.force, mesh, tally)
-    return OK
+        call_blocks(code, "influence", pack_arguments((smooth, charge, spline, mesh)), len(mesh.tallies))
 
 
 @task(count_references=False)
@@ -221,8 +223,12 @@ def _scale_positions(arguments, block):
 
 @task(count_references=False)
 def _sort_sites(arguments, block):
-    """Sort sites by the plane of their corner; the sort is stable."""
-    _smooth, _charge, _spline, mesh = load_arguments(arguments)
+    """Sort sites by the plane of their corner, if all are on the grid; the sort is stable."""
+    _smooth, _charge, _spline, mesh, status = load_arguments(arguments)
+    for b in range(len(mesh.not_finite)):
+        if mesh.not_finite[b]:
+            status[0] = NOT_FINITE
+            return
     first = mesh.first
     first[:] = 0
     for i in range(len(mesh.order)):

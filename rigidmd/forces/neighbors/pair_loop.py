@@ -9,25 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from rigidmd.compile import (
-    Code, call, call_blocks, chosen_by_type, implements, kernel, load_arguments, pack_arguments, task,
-)  # fmt: skip
+from rigidmd.compile import BoundTask, Code, Pass, chosen_by_type, kernel, load_arguments, task
 from rigidmd.compile.simd import (
     add_lane_sums, align_stack, broadcast, convert_to, extract_lane, lane_count, lanes_of, load, load_broadcast,
     load_four, load_scalar, mask_from_bits, select, store, sum_lanes, to_double, zeros,
 )  # fmt: skip
-from rigidmd.core.state import EXAMPLE, LIST_FULL, OK, TALLY_SIZE
-from rigidmd.forces import terms
+from rigidmd.core.state import LIST_FULL, OK, TALLY_SIZE
 from rigidmd.forces.neighbors import lists
 from rigidmd.forces.neighbors.lists import (
     BUILDS, MASK_BITS, STATUS, USABLE, WINDOW, PairList, behind_block, cluster_of, empty_list, end_of_row, image_number,
     largest_displacement, most_needed,
 )  # fmt: skip
-from rigidmd.forces.neighbors.sites import (
-    BodySites, CentralSites, InSlots, load_from_blocks, load_tasks, virial_buffer,
-)  # fmt: skip
-from rigidmd.forces.neighbors.update import list_code, refill, update_list
-from rigidmd.forces.terms import Setup
+from rigidmd.forces.neighbors.sites import BodySites, CentralSites, InSlots, load_passes, virial_buffer
+from rigidmd.forces.neighbors.update import list_code, refill, update_pair_list
+from rigidmd.forces.terms import FORCES_ONLY, TALLIED, WITH_ENERGIES, WITH_VIRIALS, Evaluation, Setup
 
 
 class PairSums(NamedTuple):
@@ -36,6 +31,7 @@ class PairSums(NamedTuple):
     force_at_change: np.ndarray  # (blocks, 3 lanes) force on a row at the last change of image, see `_change_image`
     tallies: np.ndarray  # (blocks, 10)
     virial: np.ndarray  # see `virial_buffer`
+    arranged: np.ndarray  # (1,) the build of the list for which the numbers of the potential are in the slots
 
 
 class PairForces(NamedTuple):
@@ -61,9 +57,10 @@ class PairForces(NamedTuple):
             force_at_change=zeros((blocks, 3 * lane_count(setup.dtype)), setup.dtype),
             tallies=np.zeros((blocks, TALLY_SIZE)),
             virial=virial_buffer(),
+            arranged=np.zeros(1, np.int64),
         )
-        with_energies = setup.with_energies if setup.needs_virials else None
-        return PairWorkspace(potential, potential.for_slots(slots, setup.dtype), sites, pairs, sums, with_energies)
+        of_slots = potential.for_slots(slots, setup.dtype)
+        return PairWorkspace(potential, of_slots, sites, pairs, sums, setup.needs_virials)
 
 
 class PairWorkspace(NamedTuple):
@@ -72,9 +69,8 @@ class PairWorkspace(NamedTuple):
     sites: BodySites | CentralSites
     pairs: PairList
     sums: PairSums
-    with_energies: np.ndarray | None  # (1,) of the `TermTable`; None if virials are never needed without energies
+    needs_virials: bool  # whether there is code for virials without energies
     list_code: Code | None = None
-    code: Code | None = None
 
     @property
     def scratch(self) -> np.ndarray:
@@ -98,19 +94,27 @@ class PairWorkspace(NamedTuple):
         return InSlots(self.sums.forces, self.pairs.clusters.slot)
 
     def with_code(self) -> "PairWorkspace":
-        list_tasks, pairs, sums = list_code(self.pairs, self.sites), self.pairs, self.sums
-        content, tallies = (self.slot_potential, pairs, sums), sums.tallies
-        tasks = {
-            "update": (_update_pairs, (list_tasks, self.potential, *content, self.sites, EXAMPLE[0])),
-            "forces": (_sum_forces, (*content, None, None)),
-            "forces_and_energies": (_sum_forces, (*content, tallies, tallies)),
-            "gather": (_gather_forces, (pairs, sums, None)),
-            "gather_with_virial": (_gather_forces, (pairs, sums, tallies)),
-        }  # fmt: skip
-        if self.with_energies is not None:
-            tasks["forces_and_virial"] = (_sum_forces, (*content, tallies, None))
-        code = Code(**tasks, **load_tasks(self.sites, self.forces_in_slots, sums.virial))
-        return self._replace(code=code, list_code=list_tasks)
+        return self._replace(list_code=list_code(self.pairs, self.sites))
+
+    def passes(self, into: Evaluation) -> list[Pass]:
+        """Update of the list; forces of rows, with what else is needed; their sums on sites and molecules."""
+        pairs, sums, sites, tallies = self.pairs, self.sums, self.sites, self.sums.tallies
+        blocks, content = len(tallies), (self.slot_potential, pairs, sums)
+        numbers = (self.potential, self.slot_potential, pairs, sums, into.status)
+        found = [
+            Pass(update_pair_list, (self.list_code, pairs, sites, into.state, into.status)),
+            Pass(_arrange_numbers, numbers),
+            Pass(_sum_forces, (*content, None, None), blocks, FORCES_ONLY),
+        ]
+        energies = (*content, tallies, tallies)
+        if self.needs_virials:
+            found.append(Pass(_sum_forces, energies, blocks, WITH_ENERGIES))
+            found.append(Pass(_sum_forces, (*content, tallies, None), blocks, WITH_VIRIALS))
+        else:
+            found.append(Pass(_sum_forces, energies, blocks, TALLIED))
+        found.append(Pass(_gather_forces, (pairs, sums, None), blocks, FORCES_ONLY))
+        found.append(Pass(_gather_forces, (pairs, sums, tallies), blocks, TALLIED))
+        return found + load_passes(sites, into, self.forces_in_slots, sums)
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":
         """With the capacity that the last build of the list needed."""
@@ -126,9 +130,17 @@ class PairWorkspace(NamedTuple):
     def restore(self, arrays: dict[str, np.ndarray], skin: float, now: float) -> "PairWorkspace":
         """With the list of a checkpoint; needs machine code. Raises ValueError if the arrays do not fit this term."""
         found = self._replace(pairs=lists.restored(self.pairs, arrays, skin, now))
-        while "order" in arrays and _refill(found):
+        while "order" in arrays and found._refill() != OK:
             found = found.with_capacity(found.pairs.cell)
         return found
+
+    def _refill(self) -> int:
+        """Build the list again from its clusters; a status code."""
+        status = np.zeros(1, np.int64)
+        BoundTask(_refill_list, (self.list_code, self.pairs, status))()
+        if status[0] == OK:
+            BoundTask(_arrange_numbers, (self.potential, self.slot_potential, self.pairs, self.sums, status))()
+        return int(status[0])
 
 
 def _buffer_behind(pairs: PairList, blocks: int, clusters: int) -> np.ndarray:
@@ -172,64 +184,25 @@ def arrange(slot_potential, potential, order):
     return lambda slot_potential, potential, order: None
 
 
-@implements(terms.add_forces, PairWorkspace, count_references=False)
-def _add_pair_forces(term, state, load, tally):
-    code, potential, pairs, sums = term.code, term.slot_potential, term.pairs, term.sums
-    everything = (term.list_code, term.potential, potential, pairs, sums, term.sites, state)
-    call(code, "update", pack_arguments(everything))
-    if pairs.counters[STATUS] != OK:
-        return pairs.counters[STATUS]
-    blocks = len(sums.tallies)
-    if tally is None:
-        call_blocks(code, "forces", pack_arguments((potential, pairs, sums, None, None)), blocks)
-        call_blocks(code, "gather", pack_arguments((pairs, sums, None)), blocks)
-    else:
-        _call_tallied(term.with_energies, code, (potential, pairs, sums, sums.tallies), blocks)
-        call_blocks(code, "gather_with_virial", pack_arguments((pairs, sums, sums.tallies)), blocks)
-    load_from_blocks(term.sites, code, state, load, InSlots(sums.forces, pairs.clusters.slot), sums, tally)
-    return OK
-
-
-@kernel
-def _call_tallied(with_energies, code, content, blocks):
-    """Call the task that also computes virials, and energies if they are needed."""
-    potential, pairs, sums, tallies = content
-    if with_energies is not None and with_energies[0] == 0:
-        call_blocks(code, "forces_and_virial", pack_arguments((potential, pairs, sums, tallies, None)), blocks)
-        return
-    call_blocks(code, "forces_and_energies", pack_arguments((potential, pairs, sums, tallies, tallies)), blocks)
-
-
 @task()
-def _update_pairs(arguments, block):
-    """Update the list, and the numbers of the potential in slots; a status code into counters[STATUS]."""
-    code, potential, slot_potential, pairs, sums, sites, state = load_arguments(arguments)
-    builds = pairs.counters[BUILDS]
-    status = update_list(pairs, code, sites, state)
-    if pairs.counters[BUILDS] != builds:
-        status = _arrange_potential(potential, slot_potential, pairs, sums)
-    pairs.counters[STATUS] = status
-
-
-@kernel
-def _arrange_potential(potential, slot_potential, pairs, sums):
-    """Put the numbers of the potential into the slots of a new list; a status code."""
+def _arrange_numbers(arguments, block):
+    """Put the numbers of the potential into the slots of a new list."""
+    potential, slot_potential, pairs, sums, status = load_arguments(arguments)
+    if sums.arranged[0] == pairs.counters[BUILDS]:
+        return
     arrange(slot_potential, potential, pairs.clusters.order)
     if 3 * lanes_of(sums.forces_behind) * most_needed(pairs, WINDOW) > sums.forces_behind.shape[1]:
         pairs.counters[USABLE] = 0
-        return LIST_FULL
-    return OK
+        pairs.counters[STATUS] = status[0] = LIST_FULL
+        return
+    sums.arranged[0] = pairs.counters[BUILDS]
 
 
-@kernel(from_python=True)
-def _refill(term):
-    """Build a list again from its clusters; a status code, also in counters[STATUS]."""
-    pairs = term.pairs
-    status = refill(pairs, term.list_code)
-    if status == OK:
-        status = _arrange_potential(term.potential, term.slot_potential, pairs, term.sums)
-    pairs.counters[STATUS] = status
-    return status
+@task()
+def _refill_list(arguments, block):
+    """`refill`, with its status code."""
+    code, pairs, status = load_arguments(arguments)
+    pairs.counters[STATUS] = status[0] = refill(pairs, code)
 
 
 @task(count_references=False)

@@ -4,16 +4,15 @@ Each potential has a list of the sites that take part in it. Sites of one molecu
 """
 
 # isort: skip_file
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from rigidmd.compile import (
-    BLOCKS, MOST_BLOCKS, call_blocks, chosen_by_type, is_a, kernel, load_arguments, pack_arguments, task,
-)  # fmt: skip
+from rigidmd.compile import BLOCKS, MOST_BLOCKS, Pass, chosen_by_type, is_a, kernel, load_arguments, task
 from rigidmd.compile.simd import lane_count, lanes_of, load_scalar
-from rigidmd.core.state import EXAMPLE
+from rigidmd.core.state import State
+from rigidmd.forces.terms import TALLIED, Evaluation
 from rigidmd.mechanics.translation import body_vector, lab_vector
 
 # Up to this number, loops over molecules run on one thread: they take a few microseconds.
@@ -253,18 +252,29 @@ def _sum_offset_virial_of_block(arguments, block):
                     virial[block, 3 * row + k] += force[row] * offset[k]
 
 
-def position_task(sites: BodySites | CentralSites, position: np.ndarray) -> dict:
-    """The task "positions" of a `Code`: `compute_site_positions` into an array (s, 3)."""
-    return {"positions": (_compute_positions_of_block, (sites, EXAMPLE[0], position))}
+def position_pass(sites: BodySites | CentralSites, state: State, position: np.ndarray) -> Pass:
+    """`compute_site_positions` into an array (s, 3)."""
+    return Pass(_compute_positions_of_block, (sites, state, position), blocks_of(len(state.position)))
 
 
-def load_tasks(sites: BodySites | CentralSites, force: np.ndarray | InSlots, virial: np.ndarray) -> dict:
-    """The tasks "load" and "offset_virial" of a `Code`, for `load_from_blocks`."""
-    state, load = EXAMPLE
-    tasks = {"load": (_load_block, (sites, state, load, force))}
+def load_passes(
+    sites: BodySites | CentralSites, into: Evaluation, force: np.ndarray | InSlots, sums: Any
+) -> list[Pass]:
+    """The passes that add site forces (s, 3) to the load, and the sums of blocks to the tally.
+
+    sums : has `tallies` (blocks, 10), energy and site virial, and `virial`, of `virial_buffer`
+    """
+    state, load, tally = into.state, into.load, into.tally
+    blocks = blocks_of(len(state.position))
+    found = [
+        Pass(_load_block, (sites, state, load, force), blocks),
+        Pass(_sum_tallies, (sums.tallies, tally), when=TALLIED),
+    ]
     if isinstance(sites, BodySites):
-        tasks["offset_virial"] = (_sum_offset_virial_of_block, (sites, state, force, virial))
-    return tasks
+        offsets = (sites, state, force, sums.virial)
+        found.append(Pass(_sum_offset_virial_of_block, offsets, blocks, TALLIED))
+        found.append(Pass(_subtract_offset_virial, (sums.virial[:blocks], tally), when=TALLIED))
+    return found
 
 
 def virial_buffer() -> np.ndarray:
@@ -272,29 +282,19 @@ def virial_buffer() -> np.ndarray:
     return np.zeros((MOST_BLOCKS, 16))
 
 
-@kernel(count_references=False)
-def load_from_blocks(sites, code, state, load, site_force, sums, tally):
-    """`load_molecule` for all molecules, on all threads; with a tally, also the sum of `sums.tallies` (blocks, 10), as
-    energy and molecular virial. code : with `load_tasks`. sums : also has `virial`, of `virial_buffer`"""
-    blocks = blocks_of(len(state.position))
-    call_blocks(code, "load", pack_arguments((sites, state, load, site_force)), blocks)
-    if tally is not None:
-        for block in range(len(sums.tallies)):
-            for k in range(len(tally)):
-                tally[k] += sums.tallies[block, k]
-        _subtract_offset_virial(sites, code, state, site_force, sums.virial, tally, blocks)
+@task()
+def _sum_tallies(arguments, block):
+    """Add the sums of all blocks (blocks, 10) to a tally."""
+    tallies, tally = load_arguments(arguments)
+    for b in range(len(tallies)):
+        for k in range(len(tally)):
+            tally[k] += tallies[b, k]
 
 
-@chosen_by_type
-def _subtract_offset_virial(sites, code, state, site_force, virial, tally, blocks):
-    """Convert the site virial in `tally` to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
-    if is_a(sites, CentralSites):
-        return lambda sites, code, state, site_force, virial, tally, blocks: None
-
-    def subtract_offset_virial(sites, code, state, site_force, virial, tally, blocks):
-        call_blocks(code, "offset_virial", pack_arguments((sites, state, site_force, virial)), blocks)
-        for block in range(blocks):
-            for k in range(9):
-                tally[1 + k] -= virial[block, k]
-
-    return subtract_offset_virial
+@task()
+def _subtract_offset_virial(arguments, block):
+    """Convert the site virial in a tally to the molecular virial: subtract sum f (x) (x_site - X_molecule)."""
+    virial, tally = load_arguments(arguments)
+    for b in range(len(virial)):
+        for k in range(9):
+            tally[1 + k] -= virial[b, k]

@@ -86,6 +86,13 @@ def update_list(pairs, code, sites, state):
     return status
 
 
+@task()
+def update_pair_list(arguments, block):
+    """`update_list`, with its status code."""
+    code, pairs, sites, state, status = load_arguments(arguments)
+    pairs.counters[STATUS] = status[0] = update_list(pairs, code, sites, state)
+
+
 @kernel(count_references=False)
 def refill(pairs, code):
     """Build the list again from the clusters that `lists.restored` has set; a status code."""

@@ -1,0 +1,92 @@
+"""Programs: tables of passes, which one runner executes.
+
+A pass is the address of a task, the address of its arguments, the number of its blocks, and a set of bits that say when
+it acts. Python makes the table from what a scene has. The runner is compiled once for everything: it calls row after
+row, and stops where a pass sets a status. The types of the arguments choose the code of a pass, and nothing above it.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rigidmd.compile.code import CompiledTask, TaskArguments, addresses_of
+from rigidmd.compile.kernels import kernel
+from rigidmd.compile.records import NumbaStruct
+from rigidmd.compile.thread_pool import call_address, run_on_all_threads
+
+#: Acts whenever the program runs.
+ALWAYS = -1
+
+
+class Pass(NamedTuple):
+    """A row of a program."""
+
+    task: CompiledTask
+    content: tuple  # its arguments
+    blocks: int = 1
+    when: int = ALWAYS  # bits
+
+
+class Rows(NamedTuple):
+    """The passes of a program as compiled code reads them. A pass that fails writes a code into `status`."""
+
+    address: np.ndarray  # (rows,) intp, of the machine code
+    arguments: np.ndarray  # (rows,) intp, of the arguments
+    blocks: np.ndarray  # (rows,)
+    when: np.ndarray  # (rows,) bits
+    status: np.ndarray  # (1,) 0 while all is well
+
+
+class Program:
+    """The passes of a program, with their machine code; keeps alive what its rows refer to.
+
+    passes : with examples of the arguments, of the types that `bind` gives
+    uses : bits; passes that act at none of these are neither compiled nor called
+    status : (1,) int64, into which passes write
+    """
+
+    def __init__(self, passes: Sequence[Pass], uses: int, status: np.ndarray):
+        self._uses = uses
+        used = self._used(passes)
+        self._kinds = [TaskArguments(numba.typeof(one.content)) for one in used]
+        addresses = addresses_of([(one.task, kind) for one, kind in zip(used, self._kinds, strict=True)])
+        when = np.array([one.when for one in used], np.intp)
+        self.rows = Rows(addresses, np.zeros_like(when), np.ones_like(when), when, status)
+        self._bound: dict[int, list[NumbaStruct]] = {}
+
+    def bind(self, passes: Sequence[Pass], arguments: np.ndarray | None = None) -> None:
+        """Set the arguments of all passes, in `rows` or in another array of addresses (rows,).
+
+        Raises TypeError if the arguments of a pass have another type than the example.
+        """
+        target = self.rows.arguments if arguments is None else arguments
+        structs = [NumbaStruct(one.content) for one in self._used(passes)]
+        for one, struct, kind in zip(self._used(passes), structs, self._kinds, strict=True):
+            if TaskArguments(struct.kind) != kind:
+                name = one.task.name[1]
+                raise TypeError(f"{name} was compiled for {kind}, not for {TaskArguments(struct.kind)}")
+        target[:] = [struct.address for struct in structs]
+        self.rows.blocks[:] = [one.blocks for one in self._used(passes)]
+        self._bound[id(target)] = structs
+
+    def _used(self, passes: Sequence[Pass]) -> list[Pass]:
+        return [one for one in passes if one.when & self._uses]
+
+
+@kernel
+def run_passes(rows, arguments, when):
+    """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0. arguments : their
+    addresses, of `rows` or others"""
+    rows.status[0] = 0
+    for k in range(len(rows.address)):
+        if rows.when[k] & when == 0:
+            continue
+        if rows.blocks[k] == 1:
+            call_address(rows.address[k], arguments[k], 0)
+        else:
+            run_on_all_threads(rows.address[k], arguments[k], rows.blocks[k])
+        if rows.status[0] != 0:
+            break
+    return rows.status[0]
