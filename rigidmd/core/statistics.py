@@ -112,13 +112,11 @@ def least_error_from(values: np.ndarray) -> int:
 
 def _begins_elsewhere(values: np.ndarray, start: int) -> bool:
     """Whether the mean before an index differs from the mean after it, by a test of Student with the variance and the
-    correlation of the second half of the series, estimated as for the error of a mean."""
+    correlation of the second half of the series."""
     from scipy import special  # slow to import
 
     late = values[len(values) // 2 :]
-    centred = late - late.mean()
-    slow = BATCH_FACTOR * _batch_variance(centred) / max(late.var(), np.finfo(float).tiny)
-    samples = max(inefficiency(centred), slow)  # per independent one
+    samples = inefficiency(late - late.mean())  # per independent one
     freedom = len(late) / samples
     variance = late.var(ddof=1) / max(0.25, 1 - 1 / freedom)
     error = sqrt(variance * (min(1.0, samples / start) + samples / (len(values) - start)))
