@@ -122,3 +122,36 @@ def test_errors_of_viscosities_are_those_of_the_scatter_over_seeds(liquids):
     print(truth)
     values = [rigidmd.analysis.viscosity(results).value() for results in liquids]
     check_pulls("viscosity", {100.0: [(value.value, value.error) for value in values]}, truth.value)
+
+
+def slab(seed):
+    """Results of a slab of 180 argon atoms in its vapour at 110 K: 60 ps and 160 ps."""
+    stage = {"ensemble": "nvt", "temperature_K": 110.0, "timestep_fs": 10.0}
+    scene = {
+        "seed": seed,
+        "box": {"lengths_A": [20.0, 20.0, 65.0], "vacuum_A": 40.0},
+        "molecules": [{"model": "argon", "count": 180}],
+        "forces": {"cutoff_A": 8.5},
+        "start": {"temperature_K": 110.0},
+        "stages": [stage | {"duration_ps": 60.0}, stage | {"duration_ps": 160.0}],
+        "output": {
+            "log_interval_ps": 0.2,
+            "trajectory_interval_ps": 1.0,
+            "pressure_tensor_interval_ps": 0.1,
+            "figures": False,
+        },
+    }
+    return Simulation(Scene.from_dict(scene)).run(progress=False)
+
+
+def test_errors_of_a_slab_are_those_of_the_scatter_over_seeds():
+    measured = {}
+    for results in (slab(seed) for seed in range(SEEDS)):
+        for length in (80.0, 160.0):
+            found = rigidmd.analysis.interfaces(results, start=220.0 - length)
+            for name in ("liquid", "vapour"):
+                value = found.value(name)
+                pairs = measured.setdefault(name, {}).setdefault(length, [])
+                pairs.append((value.value, value.error))
+    for name, of_lengths in measured.items():
+        check_pulls(name, of_lengths)
