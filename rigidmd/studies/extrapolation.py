@@ -116,7 +116,7 @@ def means_of_runs(
     """Means over the runs at each step, with errors; none where the runs are too few and too short for an error.
 
     runs : step (fs) -> value and error of each of its runs
-    together : step -> value of its runs together, which takes the place of the mean of their values
+    together : step -> value of its runs together, used instead of the mean of their values
 
     The errors of single runs give the ratios of the errors of the steps. Their common size is from the scatter of the
     runs about the means of their steps if that has at least `LEAST_FREEDOM` degrees of freedom, else as it is.

@@ -170,7 +170,7 @@ def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
 
 
 def _groups(folder: Path, manifest: Manifest, key: str) -> dict[str, _Group]:
-    """The averages of a sweep by the values of the keys other than the step and the seed, described in words."""
+    """The averages of a sweep by a description of the values of the keys other than the step and the seed."""
     short, groups = short_keys(manifest.keys), {}
     for row, (_, points) in zip(table_of(folder, manifest, True).rows, manifest.combinations(), strict=True):
         if not row.runs:
