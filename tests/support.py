@@ -408,7 +408,7 @@ HOMES = {
     "run.body": "BodyRecord BodyRun",
     "run.molecular": "MolecularRecord MolecularRun",
     "studies.accuracy.averages": ("AverageRun AveragedQuantity Averages UNSEEN measure_averages start_of_last_stage "),
-    "studies.extrapolation": "MeanAtStep extrapolate means_of_runs",
+    "studies.extrapolation": "MeanAtStep Together extrapolate means_of_runs",
     "studies.compare": "compare describe_run_comparison",
     "studies.gamma_point": "periodic_basis",
     "studies.accuracy.accuracy": "measure_accuracy trial_table write_accuracy",

@@ -21,6 +21,7 @@ from support import (
     IntegratorAccuracy,
     MeanAtStep,
     Method,
+    Together,
     Trial,
     averages_report,
     body_trial_system,
@@ -644,6 +645,34 @@ def test_means_of_few_runs_without_errors_are_left_out():
     known = means_of_runs({1.0: [(1.0, 0.3), (1.2, 0.4)], 2.0: [(1.5, 0.3)]})
     assert known[0][1:] == pytest.approx((1.0, 1.1, np.sqrt((0.09 + 0.16) / 2 / 2)))
     assert known[1][1:] == (2.0, 1.5, 0.3)
+
+
+def test_a_value_of_runs_together_takes_the_place_of_the_mean_of_their_values():
+    """Squares of means, whose values in single runs are too high, or too short for a value."""
+    rng, count = np.random.default_rng(5), 6
+    for has_values in (True, False):
+        pulls = []
+        for _ in range(1000):
+            runs, together = {}, {}
+            for dt in (1.0, 2.0, 4.0):
+                means = 3 + 0.1 * dt**2 + rng.standard_normal(count)
+                runs[dt] = [(mean**2, 6.0) for mean in means] if has_values else []
+                error = 2 * means.mean() * means.std(ddof=1) / np.sqrt(count)
+                together[dt] = Together(means.mean() ** 2 - means.var(ddof=1) / count, error, count)
+            points = means_of_runs(runs, together)
+            assert [point.mean for point in points] == [value.value for value in together.values()]
+            fit = extrapolate([point._replace(mean=point.mean - 0.01 * point.timestep**4) for point in points])
+            pulls.append((fit.limit - 9) / fit.limit_error)
+        assert abs(np.mean(pulls)) < 0.15
+        assert 0.85 < np.std(pulls) < 1.2
+
+
+def test_two_runs_together_have_a_limit_and_a_wide_error():
+    together = {dt: Together(5.0 + dt**2, 0.1, 2) for dt in (1.0, 2.0)}
+    points = means_of_runs({}, together)
+    assert [point.error for point in points] == pytest.approx([0.1 * 1.32] * 2, rel=0.01)
+    mixed = means_of_runs({4.0: [(21.0, 0.3)]}, together)
+    assert mixed == []
 
 
 @pytest.fixture(scope="module")

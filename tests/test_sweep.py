@@ -320,6 +320,32 @@ def test_averages_at_a_step_of_zero(argon, tmp_path, capsys, monkeypatch):
     assert (folder / "extrapolation.png").stat().st_size > 10_000
 
 
+def test_values_of_replicas_together_are_extrapolated(argon, tmp_path):
+    """Not the means of the values of single runs: heights of peaks differ, and diffusion has none there."""
+    folder = tmp_path / "steps"
+    swept = {STEP: [5, 10], "seed": [1, 2, 3], "stages.0.duration_ps": 2.0}
+    with ExitStack() as stack:
+        there = sweeping.open_sweep(stack, argon, sweeping.axes_of(swept), folder, step=STEP)
+        for point in there.manifest.points:
+            Simulation(Scene.read(argon, there.manifest.overrides(point)), folder / point.folder).run(progress=False)
+    assert cli.main(["analyse", str(folder), "--only", "rdf", "--extrapolate", STEP]) == 0
+    with (folder / "analysis.csv").open(encoding="utf-8") as file:
+        together = {float(row[STEP]): row for row in csv.DictReader(file)}
+    name = next(name for name in together[5.0] if "height" in name and "error" not in name)
+    with (folder / "extrapolation.csv").open(encoding="utf-8") as file:
+        limit = next(row for row in csv.DictReader(file) if row["average"] == name)
+    for step, row in together.items():
+        biased = float(limit["limit"]) + float(limit[f"bias at {step:g} fs"])
+        assert biased == pytest.approx(float(row[name]), rel=1e-6)
+        tables = [
+            json.loads((folder / point.folder / "analysis.json").read_text())["analyses"]["rdf"]["values"]
+            for point in there.manifest.points
+            if point.values[STEP] == step
+        ]
+        singles = [next(value for value in values if "height" in value["name"])["value"] for values in tables]
+        assert abs(np.mean(singles) - float(row[name])) > 1e-4
+
+
 def test_the_order_of_an_extrapolation_is_that_of_the_integrator(argon, tmp_path):
     """By dt⁴ for srkn_4: 1, 16, 81 times the slope."""
     folder = tmp_path / "steps"

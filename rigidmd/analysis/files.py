@@ -92,6 +92,7 @@ class _FramesUsed(BaseModel):
     from_ps: Bounded
     to_ps: Bounded
     frames: int
+    runs: int = 1
     notes: list[str]
 
 
@@ -190,6 +191,7 @@ def analyse_frames(
         "from_ps": min(float(run.time[0]) for run in runs.members),
         "to_ps": max(float(run.time[-1]) for run in runs.members),
         "frames": runs.frame_count,
+        "runs": len(runs.members),
         "notes": runs.first.notes,
     }
     if runs.are_several:

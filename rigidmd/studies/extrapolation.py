@@ -92,24 +92,58 @@ def _fit(points: Sequence[MeanAtStep], longest: float, exact: float | None, orde
     return BiasFit(limit, limit_error, slopes, weights, longest, order, chi2, freedom)
 
 
-def means_of_runs(runs: Mapping[float, Sequence[tuple[float, float | None]]]) -> list[MeanAtStep]:
+class Together(NamedTuple):
+    """A value of several runs analysed together, and its error over the runs."""
+
+    value: float
+    error: float
+    runs: int
+
+
+class _AtStep(NamedTuple):
+    """A mean at a step; variance : of a single run by its own error, None if unknown."""
+
+    mean: float
+    runs: int
+    squares: float  # sum of the squares of the deviations of the runs from the mean
+    variance: float | None
+
+
+def means_of_runs(
+    runs: Mapping[float, Sequence[tuple[float, float | None]]],
+    together: Mapping[float, Together] | None = None,
+) -> list[MeanAtStep]:
     """Means over the runs at each step, with errors; none where the runs are too few and too short for an error.
 
     runs : step (fs) -> value and error of each of its runs
+    together : step -> value of its runs together, used instead of the mean of their values
+
     The errors of single runs give the ratios of the errors of the steps. Their common size is from the scatter of the
     runs about the means of their steps if that has at least `LEAST_FREEDOM` degrees of freedom, else as it is.
+    Values of runs together need no errors of single runs.
     """
-    steps = {step: np.array([value for value, _ in found]) for step, found in runs.items() if found}
-    within = [[e**2 for _, e in runs[step] if e is not None] for step in steps]  # variances of single runs
-    known = all(within) and all(np.mean(of_step) > 0 for of_step in within)
-    variances = [float(np.mean(of_step)) if known else 1.0 for of_step in within]
-    freedom, factor = sum(len(values) - 1 for values in steps.values()), 1.0
-    if freedom >= LEAST_FREEDOM:
-        squares = sum(len(x) * x.var() / v for x, v in zip(steps.values(), variances, strict=True))
-        factor = sqrt(float(squares) / freedom) * student_factor(freedom)
+    together = together or {}
+    names = [step for step in dict.fromkeys([*runs, *together]) if step in together or runs[step]]
+    steps = {step: _at_step(runs.get(step, ()), together.get(step)) for step in names}
+    known = all(at.variance is not None for at in steps.values())
+    variances = [(at.variance if known else None) or 1.0 for at in steps.values()]
+    freedom, factor = sum(at.runs - 1 for at in steps.values()), 1.0
+    if freedom >= LEAST_FREEDOM or (not known and together.keys() >= steps.keys()):
+        squares = sum(at.squares / variance for at, variance in zip(steps.values(), variances, strict=True))
+        factor = sqrt(squares / freedom) * student_factor(freedom)
     elif not known:
         return []
     return [
-        MeanAtStep("", step, float(values.mean()), factor * sqrt(variance / len(values)))
-        for (step, values), variance in zip(steps.items(), variances, strict=True)
+        MeanAtStep("", step, at.mean, factor * sqrt(variance / at.runs))
+        for (step, at), variance in zip(steps.items(), variances, strict=True)
     ]
+
+
+def _at_step(runs: Sequence[tuple[float, float | None]], together: Together | None) -> _AtStep:
+    values = np.array([value for value, _ in runs])
+    within = [error**2 for _, error in runs if error is not None]
+    variance = float(np.mean(within)) if any(within) else None
+    if together is None:
+        return _AtStep(float(values.mean()), len(values), float(len(values) * values.var()), variance)
+    count = together.runs
+    return _AtStep(together.value, count, count * (count - 1) * together.error**2, variance)

@@ -1,5 +1,6 @@
 """Structure: g(r), structure factor, density profile, hydrogen bonds."""
 
+from collections.abc import Callable
 from itertools import combinations_with_replacement, product
 
 import numpy as np
@@ -18,7 +19,7 @@ from rigidmd.analysis.result import (
 )
 from rigidmd.analysis.rigid_frames import RigidFrames
 from rigidmd.analysis.runs import Runs
-from rigidmd.core.statistics import error_of_mean, mean_and_error
+from rigidmd.core.statistics import error_of_mean, inefficiency
 from rigidmd.errors import OutputError
 from rigidmd.io.trajectory import near_pairs
 from rigidmd.run.rigid_fit import Kind
@@ -32,6 +33,8 @@ FEWEST, MOST = 20, 500  # frames
 LARGEST, WIDTH = 10.0, 0.05
 #: 1/Å: largest wave vector and width of bins of S(k); most wave vectors of a bin.
 K_MAX, K_WIDTH, VECTORS_PER_BIN = 8.0, 0.1, 24
+#: Blocks of frames for errors of peaks; least fraction of the variance of blocks by which their correlation reduces it.
+PEAK_BLOCKS, LEAST_INDEPENDENT = 10, 0.25
 #: Å and degrees: largest O···O and H-O···O of a hydrogen bond (Luzar & Chandler 1996, Nature 379, 55).
 BOND_DISTANCE, BOND_ANGLE = 3.5, 30.0
 BONDING = ("N", "O", "F")  # donors and acceptors of hydrogen bonds
@@ -173,9 +176,10 @@ def _peaks(name: str, r: np.ndarray, runs: Runs, frames: list[np.ndarray], fille
     if runs.are_several:
         errors = runs.estimate([of_run.mean(axis=0) for of_run in frames], seen_near)[1].tolist()
     elif len(frames[0]) >= 2 * BLOCKS:
-        blocks = error_of_mean([seen_near(part.mean(axis=0)) for part in np.array_split(frames[0], BLOCKS)])
-        series = [*_changes_of_vertex(g, frames[0], top, width), inside[0]]  # to first order; blocks are few
-        errors = [max(float(block), mean_and_error(one)[1] or 0.0) for block, one in zip(blocks, series, strict=True)]
+        samples = max(inefficiency(series - series.mean()) for series in (frames[0][:, top], inside[0]))
+        of_blocks, left_out = _errors_over_blocks(frames[0], seen_near, samples)
+        errors = np.maximum(of_blocks, left_out).tolist()
+        errors[2] = float(np.hypot(of_blocks[2], left_out[2]) / np.sqrt(2))  # jumps of the minimum count once
     titles = (("first peak", "Å"), ("height of that peak", "1"), ("neighbours up to the first minimum", "1"))
     return [
         Value(f"g {name}: {title}", unit, float(value), None if e is None else float(e), tau)
@@ -189,16 +193,20 @@ def _shift_of_vertex(low: float, middle: float, high: float) -> float:
     return float(0.5 * (low - high) / bend) if bend < 0 else 0.0
 
 
-def _changes_of_vertex(g: np.ndarray, frames: np.ndarray, top: int, width: float) -> list[np.ndarray]:
-    """Position and height (f,) of a peak that follow to first order from the differences of frames (f, bins) from their
-    mean g (bins,), up to constants."""
-    low, middle, high = g[top - 1 : top + 2]
-    shift, bend = _shift_of_vertex(low, middle, high), low - 2 * middle + high
-    near = frames[:, top - 1 : top + 2] - g[top - 1 : top + 2]
-    of_bend = np.array([1.0, -2.0, 1.0])
-    of_position = width * (np.array([0.5, 0.0, -0.5]) - shift * of_bend) / bend if bend < 0 else np.zeros(3)
-    of_height = np.array([0.5 * shift * (shift - 1), 1 - shift**2, 0.5 * shift * (shift + 1)])
-    return [near @ of_position, near @ of_height]
+def _errors_over_blocks(frames: np.ndarray, conclude: Callable[[np.ndarray], np.ndarray], samples: float) -> Measured:
+    """Two estimates of the standard errors of what follows from the mean of frames (f, ...): the scatter of blocks of
+    frames, whose means are noisy, and that of leaving out one block after another, which sees few of the jumps.
+
+    samples : frames for each independent one
+    """
+    count = min(PEAK_BLOCKS, len(frames) // 2)
+    parts = np.array_split(frames, count)
+    total = frames.sum(axis=0)
+    without = [(total - part.sum(axis=0)) / (len(frames) - len(part)) for part in parts]
+    of_blocks = error_of_mean([conclude(part.mean(axis=0)) for part in parts])
+    left_out = (count - 1) * error_of_mean([conclude(mean) for mean in without])
+    correlated = np.sqrt(max(LEAST_INDEPENDENT, 1 - 0.5 * samples * count / len(frames)))
+    return of_blocks / correlated, left_out / correlated
 
 
 def _first_top(g: np.ndarray) -> int:

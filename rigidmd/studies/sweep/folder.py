@@ -167,6 +167,11 @@ def point_name(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
     return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
+def combination_folder(folder: Path, values: Mapping[str, Any], short: Mapping[str, str]) -> Path:
+    """The folder of what the replicas of a combination of values have together."""
+    return folder / point_name(values, short) if values else folder
+
+
 def describe_values(values: Mapping[str, Any], short: Mapping[str, str]) -> str:
     """Values for messages: temperature_K = 280, seed = 1."""
     return ", ".join(f"{short[key]} = {value_name(value)}" for key, value in values.items())

@@ -1,11 +1,13 @@
 """Averages of a sweep over a time step, extrapolated to a step of 0: extrapolation.csv, .png and .html."""
 
 import csv
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidmd.analysis.files import read_table
 from rigidmd.core.statistics import format_signed
 from rigidmd.engines.samples import COLUMNS
 from rigidmd.errors import SceneError
@@ -13,10 +15,10 @@ from rigidmd.figures.style import INK, curve_style, open_axis, panel_grid, write
 from rigidmd.io.folder import SCENE, add_to_folder
 from rigidmd.io.write import Column, Table, nine_digits, with_error
 from rigidmd.scene import MolecularScene, Scene
-from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, extrapolate, means_of_runs
-from rigidmd.studies.sweep.folder import Manifest, describe_values, short_keys
+from rigidmd.studies.extrapolation import BiasFit, MeanAtStep, Together, extrapolate, means_of_runs
+from rigidmd.studies.sweep.folder import Manifest, combination_folder, describe_values, short_keys
 from rigidmd.studies.sweep.plan import update_state
-from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, key_columns, table_of
+from rigidmd.studies.sweep.table import DRIFT, MAIN, SHORT, Measured, key_columns, table_of
 from rigidmd.view.page import code, items, page, plain, section, table, wide, write_page
 
 OPTION = "--extrapolate"
@@ -116,15 +118,60 @@ def step_key(manifest: Manifest, key: str, scene: Scene) -> tuple[str, int]:
     return first, named[-1]
 
 
-def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
-    """Extrapolate all averages of the logs of a sweep, and of the analyses in the folders of its runs, to a step of 0.
+@dataclass
+class _Group:
+    """Averages of the combinations that differ in the step alone."""
 
+    values: dict[str, Any]  # of the other keys
+    integrator: str
+    order: int
+    #: Average -> step (fs) -> its value and error of each run.
+    runs: dict[str, dict[float, list[Measured]]] = field(default_factory=dict)
+    #: Average -> step -> its value of the runs together.
+    together: dict[str, dict[float, Together]] = field(default_factory=dict)
+
+    def names(self) -> list[str]:
+        return list(dict.fromkeys([*self.runs, *self.together]))
+
+    def steps(self, name: str) -> set[float]:
+        """The steps at which an average has a value."""
+        return self.runs.get(name, {}).keys() | self.together.get(name, {}).keys()
+
+    def is_constant(self, name: str) -> bool:
+        values = {value for found in self.runs.get(name, {}).values() for value, _ in found}
+        return len(values | {found.value for found in self.together.get(name, {}).values()}) == 1
+
+    def means(self, name: str) -> list[MeanAtStep]:
+        return means_of_runs(self.runs.get(name, {}), self.together.get(name, {}))
+
+
+def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
+    """Extrapolate all averages of the logs of a sweep, and the values of analyses, to a step of 0.
+
+    Values of analyses are those of replicas together, where they have been analysed together, else of single runs.
     Raises SceneError if the key is not a swept time step, OutputError.
     """
     for point in manifest.points:
         update_state(folder, point)
-    short, limits, missing = short_keys(manifest.keys), [], []
-    groups: dict[str, tuple[dict, str, int, dict[str, dict[float, list]]]] = {}
+    limits, missing = [], []
+    for title, group in _groups(folder, manifest, key).items():
+        for column in group.names():
+            if column == DRIFT or group.is_constant(column):
+                continue
+            name = f"{title}: {column}" if title else column
+            if len(group.steps(column)) < 2:
+                missing.append(f"{name}: has values at one step only")
+            elif points := group.means(column):
+                fit = extrapolate(points, order=group.order)
+                limits.append(Limit(group.values, group.integrator, column, points, fit))
+            else:
+                missing.append(f"{name}: the runs are too short and too few for an error")
+    return Limits(manifest.name, key, limits, missing)
+
+
+def _groups(folder: Path, manifest: Manifest, key: str) -> dict[str, _Group]:
+    """The averages of a sweep by a description of the values of the keys other than the step and the seed."""
+    short, groups = short_keys(manifest.keys), {}
     for row, (_, points) in zip(table_of(folder, manifest, True).rows, manifest.combinations(), strict=True):
         if not row.runs:
             continue
@@ -133,23 +180,27 @@ def extrapolate_sweep(folder: Path, manifest: Manifest, key: str) -> Limits:
         first, k = step_key(manifest, key, scene)
         stage = scene.stages[k]  # pyright: ignore[reportAttributeAccessIssue]  (it has stages)
         others = {name: value for name, value in row.values.items() if name != first}
-        group = others, stage.integrator, stage.scheme.order, {}
-        _, _, _, columns = groups.setdefault(describe_values(others, short), group)
+        group = _Group(others, stage.integrator, stage.scheme.order)
+        group = groups.setdefault(describe_values(others, short), group)
+        step = float(row.values[first])
         for column in dict.fromkeys(column for run in row.runs.values() for column in run):
             found = [run[column] for run in row.runs.values() if column in run]
-            columns.setdefault(column, {})[float(row.values[first])] = found
-    for title, (others, integrator, order, columns) in groups.items():
-        for column, steps in columns.items():
-            if column == DRIFT or len({value for found in steps.values() for value, _ in found}) == 1:
-                continue
-            name = f"{title}: {column}" if title else column
-            if len(steps) < 2:
-                missing.append(f"{name}: has values at one step only")
-            elif points := means_of_runs(steps):
-                limits.append(Limit(others, integrator, column, points, extrapolate(points, order=order)))
-            else:
-                missing.append(f"{name}: the runs are too short and too few for an error")
-    return Limits(manifest.name, key, limits, missing)
+            group.runs.setdefault(column, {})[step] = found
+        if len(points) > 1:
+            where = combination_folder(folder, row.values, short)
+            for column, value in _values_together(where).items():
+                group.together.setdefault(column, {})[step] = value
+    return groups
+
+
+def _values_together(folder: Path) -> dict[str, Together]:
+    """The values of analyses of several runs together that have an error, by their headers. Raises OutputError."""
+    return {
+        value.header: Together(value.value, value.error, entry.frames_used.runs)
+        for entry in read_table(folder).values()
+        for value in entry.values
+        if entry.frames_used.runs > 1 and value.value is not None and value.error is not None
+    }
 
 
 def write_limits(folder: Path, found: Limits, command: str) -> list[str]:

@@ -19,8 +19,8 @@ from rigidmd.run.record import read_record
 from rigidmd.studies.sweep.folder import (
     SEED,
     Manifest,
+    combination_folder,
     describe_values,
-    point_name,
     read_manifest,
     short_keys,
     state_on_disk,
@@ -72,7 +72,7 @@ def analyse_sweep(
         finished = [point.folder for point in points if point.folder in ready]
         if not finished:
             continue
-        where = folder / point_name(values, short) if values else folder
+        where = combination_folder(folder, values, short)
         title = describe_values(values, short)
         request = _Request(names, start, viscosity, figures)
         show = lambda part, name, seen=seen: progress((seen + part) / len(ready), name)  # noqa: E731
