@@ -30,8 +30,8 @@ def mean_force_of_sweep(
     """The potential of mean force of the points that have finished, and its files. Raises OutputError."""
     of = [(key, KEY.fullmatch(key)) for key in manifest.keys]
     if not is_of_windows(manifest):
-        why = "--set fields.restraints.0.distance_A=3.5,4,4.5,..."
-        raise OutputError(f"{folder}: pmf needs a sweep over the distance of a restraint: {why}")
+        key = "fields.restraints.0.distance_A"
+        raise OutputError(f"{folder}: pmf needs a sweep over the distance of a restraint, such as {key}")
     if other := [key for key, found in of if found is None and key != SEED]:
         raise OutputError(f"{folder}: pmf needs windows that differ by their restraint alone, not by {other[0]}")
     numbers = {int(found[1]) for _, found in of if found is not None}
