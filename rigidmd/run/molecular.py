@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build, integrator_of_stage
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.time_step import accuracy_warnings, stable_angle
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.compile.machine import usable_threads
@@ -179,7 +179,8 @@ class MolecularRun(RunPart):
                         method = self._integrator(k)
                         self.engine.advance(self._state_for(method), method, 0.0, 0)
         self.engine.forget()
-        for sentence in velocity_notes(self.system, self.state):
+        sentences = [*velocity_notes(self.system, self.state), *accuracy_warnings(self.scene)]
+        for sentence in sentences:
             self.simulation.note(sentence)
 
     def _remove_overlaps(self) -> None:
