@@ -191,11 +191,12 @@ SENTENCES = {
 ADVICE = ": write "
 #: Number of a text with a unit, such as "1 ns".
 WITH_UNIT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zÅµ°/]*\d?)\s*")
+BOHR = 0.529177210903  # Å
 #: By the unit of a key, the sizes of other units in it.
 OTHER_UNITS = {
     "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
     "fs": {"as": 1e-3, "fs": 1.0, "ps": 1e3, "ns": 1e6, "s": 1e15},
-    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "nm": 10.0},
+    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "bohr": BOHR, "nm": 10.0},
     "K": {"K": 1.0},
     "bar": {"Pa": 1e-5, "kPa": 1e-2, "MPa": 10.0, "GPa": 1e4, "bar": 1.0, "kbar": 1e3, "atm": 1.01325},
     "kJ_mol": {"J/mol": 1e-3, "kJ/mol": 1.0, "kcal/mol": 4.184},
