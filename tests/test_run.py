@@ -27,6 +27,7 @@ from support import (
     SCHEMES,
     Engine,
     MolecularRecord,
+    MolecularRun,
     Sample,
     Samples,
     State,
@@ -56,7 +57,6 @@ from rigidmd.commands.cli import main
 from rigidmd.compile.cache import CacheIndex
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Observer, Simulation, run_together
-from rigidmd.run.molecular import MolecularRun
 from rigidmd.scene import MolecularScene, Scene
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 

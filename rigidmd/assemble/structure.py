@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.assignment import massive_sites
-from rigidmd.assemble.matching import NO_MASS, MatchedMolecules, match
+from rigidmd.assemble.atom_kinds import NO_MASS
+from rigidmd.assemble.matching import MatchedMolecules, match
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state

@@ -15,7 +15,7 @@ from rigidmd.dynamics.model import remove_momentum
 from rigidmd.engines.samples import COLUMNS, NOT_AVERAGED, Samples
 from rigidmd.errors import SceneError, SimulationError, option
 from rigidmd.run import Simulation
-from rigidmd.run.molecular import scale_to_mean_box
+from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
