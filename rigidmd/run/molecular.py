@@ -255,6 +255,8 @@ class MolecularRun(RunPart):
 
     def reenter_segment(self, k: int) -> Segment:
         stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
+        for force in self.system.python_forces.values():
+            force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
             return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
         return Segment(self._integrator(k), step, stage.steps, together=stage.steps_together)
