@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rigidmd.studies.normal_modes import normal_modes
     from rigidmd.studies.stored_runs import read_run
     from rigidmd.studies.sweep.sweeping import sweep
+    from rigidmd.studies.sweep.windows import pmf
     from rigidmd.view.plots import LivePlot
 
     __version__: str
@@ -43,16 +44,16 @@ _HOMES = {
     "integrator": "scene.integrators",
     "compiled_force": "dynamics.user_kernels", "compiled_thermostat": "dynamics.user_kernels",
     "LivePlot": "view.plots", "read_run": "studies.stored_runs", "sweep": "studies.sweep.sweeping",
-    "normal_modes": "studies.normal_modes",
+    "normal_modes": "studies.normal_modes", "pmf": "studies.sweep.windows",
     "analysis": "", "view": "",
 }  # fmt: skip
 __all__ = [
     "BodyScene", "Every", "Force", "LivePlot", "MolecularScene", "Moment", "Observer", "PairLaw", "Results", "Scene",
     "Simulation", "analysis", "atoms_of", "compiled_force", "compiled_thermostat", "integrator", "normal_modes",
-    "pair_law", "read_run", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
+    "pair_law", "pmf", "read_run", "resolve", "run_together", "scene_from_atoms", "sweep", "trust", "view",
 ]  # fmt: skip
 
-PROVIDERS.append("rigidmd.view.notebook")
+PROVIDERS += ["rigidmd.view.notebook", "rigidmd.studies.sweep.notebook"]
 
 
 def __getattr__(name: str) -> object:

@@ -288,7 +288,7 @@ FRESH: list[Mutation] = [
     ),
     Mutation(
         "F41", "a stage in the mean box: the energy of the scaling is not booked",
-        "run/molecular.py",
+        "run/mean_box.py",
         "    state.energy_ledger[WORK] += observe(system, engine, state, energy_unit=1.0).potential - before\n",
         "    state.energy_ledger[WORK] += 0.0 * before\n",
         ("test_mean_box.py::test_the_energy_of_the_scaling_is_work_and_no_drift",),

@@ -31,6 +31,8 @@ def faults(**tables):
         ({"run": RUN | {"integrator": "baoab"}}, "is 'baoab', which has a thermostat, for molecules"),
         ({"run": RUN | {"duration_s": "2 ms"}}, "must be a number: write 0.002, in s"),
         ({"watch": {"energy": 1e-30}}, "must not be less than 1e-09"),
+        ({"body": {"mass_kg": 1.0, "solid": CUBE | {"lengths_m": [1e90, 1e90, 1e80]}}, "start": {"angular_velocity_body_rad_s": [1.0, 0, 2.0]}}, "energy at the start: mass, moments of inertia or rates are too large"),
+        ({"body": {"mass_kg": 1e90}, "start": {"velocity_m_s": [1e90, 0.0, 1.0]}}, "are too large"),
         ({"body": {"mass_kg": -1.0}}, "must be greater than 0"),
         ({"body": {}}, "mass_kg is missing"),
         ({"body": {"mass_kg": 1.0, "solid": {"shape": "con", "radius_m": 1.0}}}, "did you mean cone?"),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from support import SCHEMES, built, integrator_of_stage, mean_and_error, small_scene
 
-from rigidmd.errors import SceneError
+import rigidmd
+from rigidmd.errors import SceneError, SimulationError
 from rigidmd.run import Simulation
 from rigidmd.scene import Scene
 from rigidmd.units import BOLTZMANN
@@ -139,6 +140,67 @@ def test_a_trajectory_that_diverges_is_rejected(name):
     assert np.abs(results["drift"]).max() < 1e-9 * np.abs(results["energy"]).max()
     assert any("0.0% of the trajectories were accepted" in note for note in results.summary["notes"])
     assert results.summary["stages"][0]["trajectories"] == 4
+
+
+class Pen(rigidmd.Force):
+    """A force of 0 that cannot be computed where a site is too far from its start."""
+
+    name, reach = "pen", 1.0  # Å
+
+    def __init__(self, beyond):
+        self.beyond = beyond
+
+    def begin(self, system):
+        self.start = system.state.position.copy()
+
+    def at(self, position):
+        assert np.isfinite(position).all()
+        energy, force = 0.0, np.zeros_like(position)
+        return self.beyond(force) if self.is_beyond(position) else (energy, force)
+
+    def is_beyond(self, position):
+        return bool(np.abs(position - self.start).max() > self.reach)
+
+
+class PenOfSites(Pen):
+    def on_sites(self, position, state):
+        return self.at(position)
+
+
+class PenOfMolecules(Pen):
+    def on_molecules(self, state):
+        return self.at(state.position)
+
+
+def run_in(pen):
+    """Trajectories of 0.1 ps, of which some leave the pen."""
+    stage = HYBRID | {"timestep_fs": 10.0, "trajectory_steps": 10, "duration_ps": 4.0}
+    output = {"trajectory": False, "figures": False, "log_interval_ps": 0.1}
+    tables = {"forces": {"cutoff_A": 5.0}, "stages": [stage], "output": output}
+    return Simulation(small_scene({"argon": 8}, 16.0, **tables), forces=[pen], warn=str).run()
+
+
+@pytest.mark.parametrize("kind", [PenOfSites, PenOfMolecules])
+@pytest.mark.parametrize(
+    "beyond",
+    [lambda force: (np.nan, force), lambda force: (0.0, force + np.nan), lambda force: (np.inf, force)],
+    ids=["energy", "forces", "infinite"],
+)
+def test_a_trajectory_whose_python_force_is_not_finite_is_rejected(kind, beyond):
+    pen = kind(beyond)
+    results = run_in(pen)
+    assert not pen.is_beyond(results.state.position)
+    assert 0.05 < results["acceptance"][1:].mean() < 0.95
+    assert np.isfinite(results["potential"]).all()
+    assert np.abs(results["drift"]).max() < 1e-9
+
+
+def test_an_exception_of_a_python_force_ends_the_run():
+    def fail(force):
+        raise ZeroDivisionError("too far")
+
+    with pytest.raises(SimulationError, match="on_sites of the force pen raised ZeroDivisionError: too far"):
+        run_in(PenOfSites(fail))
 
 
 def test_every_metropolis_test_has_its_own_random_number():

@@ -123,13 +123,20 @@ def swept(folder, duration, distances):
 
 @pytest.mark.soak
 def test_a_sweep_of_windows(tmp_path, capsys):
-    swept(tmp_path, 40, [4.0, 4.8])
+    results = swept(tmp_path, 40, [4.0, 4.8])
+    before = {path: path.read_bytes() for path in (tmp_path / "sweep").rglob("*") if path.is_file()}
+    curves = [rigidmd.pmf(sweep).curves[0] for sweep in (results, tmp_path / "sweep")]
+    assert {path: path.read_bytes() for path in (tmp_path / "sweep").rglob("*") if path.is_file()} == before
     assert main(["analyse", str(tmp_path / "sweep"), "--only", "pmf", "--figures", "svg"]) == 0
     printed = capsys.readouterr().out
     assert "potential of mean force along a restrained distance" in printed
     assert "W lowest" in printed and "2 windows" in printed
     for name in ("pmf.csv", "pmf.svg", "analysis.json"):
         assert (tmp_path / "sweep" / name).is_file()
+    columns = np.genfromtxt(tmp_path / "sweep" / "pmf.csv", delimiter=",", names=True)
+    for curve in curves:
+        means = next(iter(curve.columns.values()))
+        assert means == pytest.approx(columns[columns.dtype.names[1]], rel=1e-6)
     point = next(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert main(["analyse", str(point), "--only", "pmf"]) == 2
     assert "pmf needs a sweep over the distance of a restraint" in capsys.readouterr().err

@@ -158,6 +158,33 @@ def test_check_warns_of_steps_by_their_accuracy(step, words, tmp_path, capsys):
     assert words in told if words else told == ""
 
 
+@pytest.mark.parametrize(("step", "words"), [(10.0, "is inaccurate for spce at 300 K"), (2.0, "")])
+def test_a_run_notes_inaccurate_steps(step, words):
+    stages = [{"ensemble": "nvt", "temperature_K": 300.0, "timestep_fs": step, "duration_ps": 2e-3 * step}]
+    scene = small_scene({"spce": 20}, 30.0, stages=stages, forces={"cutoff_A": 6.0, "electrostatics": "reaction_field"})
+    notes = rigidmd.Simulation(scene, warn=str).run().summary["notes"]
+    assert any(words in note for note in notes) if words else not any("timestep" in note for note in notes)
+
+
+@pytest.mark.parametrize(("step", "words"), [(0.05, "timestep_s = 0.05 is inaccurate"), (0.002, "")])
+def test_a_run_of_a_body_notes_inaccurate_steps(step, words):
+    changes = {"run.timestep_s": step, "run.integrator": "velocity_verlet", "run.duration_s": 2 * step}
+    scene = rigidmd.Scene.read(ROOT / "systems" / "heavy_top_3.toml", changes | {"output.interval_s": step})
+    notes = rigidmd.Simulation(scene, warn=str).run().summary["notes"]
+    assert any(words in note for note in notes) if words else not any("timestep" in note for note in notes)
+
+
+@pytest.mark.parametrize(("sigma", "warns"), [(0.34, True), (3.4, False)])
+def test_a_shown_model_is_compared_with_usual_units(sigma, warns, tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    site = f'name = "Ar"\nmass_u = 39.948\nsigma_A = {sigma}\nepsilon_kJ_mol = 1.0\nposition_A = [0, 0, 0]\n'
+    path.write_text(f'name = "mine"\n[[sites]]\n{site}')
+    assert main(["models", str(path)]) == 0
+    printed = capsys.readouterr()
+    assert ("is it in nm?" in printed.err) == warns
+    assert "mine" in printed.out
+
+
 def test_a_run_repeats_the_warnings_of_check(tmp_path):
     stages = [{"ensemble": "nvt", "temperature_K": 90.0, "duration_ps": 0.004}]
     site = ARGON | {"mass_u": 4.0}

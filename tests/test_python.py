@@ -562,3 +562,25 @@ def test_a_simulation_cannot_be_pickled_or_copied():
         with pytest.raises(TypeError, match="a Simulation has compiled code"):
             attempt(simulation)
     assert np.array_equal(pickle.loads(pickle.dumps(simulation.state)).position, simulation.state.position)
+
+
+def test_messages_name_arguments_of_python_not_options(tmp_path):
+    """Of overrides, sweeps and code that is not trusted."""
+    path = tmp_path / "argon.toml"
+    path.write_text((ROOT / "systems" / "argon.toml").read_text())
+    (tmp_path / "spring.py").write_text("x = 3\n")
+    entry = {"module": "spring.py", "name": "x"}
+    first = "stages.0.temperature_K"
+    for expected, call in {
+        "overrides stages.0.timestep_fs: is -1": lambda: Scene.read(path, {"stages.0.timestep_fs": -1}),
+        "overrides stages.7.x: stages has entries 0 to": lambda: Scene.read(path, {"stages.7.x": 1}),
+        "overrides={'box.volume': None}: box has no volume": lambda: Scene.read(path, {"box.volume": None}),
+        f"sets={{'{first}': [280, 290]}} or sets={{'seed': range(1, 9)}}": lambda: rigidmd.sweep(path, {"seed": 1}),
+        "call rigidmd.trust(": lambda: rigidmd.resolve(Scene.read(path, {"forces.custom": [entry]})),
+        "no Python file by module": lambda: rigidmd.sweep(path, {"seed": [1, 2]}, trust=[tmp_path / "spring.py"]),
+        "there is no such file": lambda: rigidmd.trust(tmp_path / "other.py"),
+    }.items():
+        with pytest.raises(SceneError) as caught:
+            call()
+        assert expected in str(caught.value)
+        assert "--" not in str(caught.value)

@@ -925,9 +925,11 @@ def test_a_chain_of_batch_jobs_is_one_run(stopped, tmp_path):
 
 
 def taken_away(path: Path, how: str) -> None:
-    """Remove a file, or put another one in its place."""
+    """Remove a file, cut it, or put another one in its place."""
     if how == "removed":
         path.unlink()
+    elif how == "changed by another program":
+        os.truncate(path, 0)
     else:
         content = path.read_bytes()
         path.unlink()
@@ -953,6 +955,8 @@ def loses(tmp_path: Path, name: str, how: str, stages: int, **output) -> Simulat
 
 VANISHING = [
     ("log.csv", "removed"),
+    ("log.csv", "changed by another program"),
+    ("trajectory.xtc", "changed by another program"),
     ("trajectory.xtc", "replaced by another file"),
     ("trajectory.gsd", "removed"),
 ]

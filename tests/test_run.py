@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import MDAnalysis as mda
+import numba
 import numpy as np
 import pytest
 from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -26,6 +27,7 @@ from support import (
     SCHEMES,
     Engine,
     MolecularRecord,
+    MolecularRun,
     Sample,
     Samples,
     State,
@@ -52,6 +54,7 @@ from support import (
 
 import rigidmd
 from rigidmd.commands.cli import main
+from rigidmd.compile.cache import CacheIndex
 from rigidmd.errors import OutputError, RigidMDWarning, SceneError, SimulationError
 from rigidmd.run import Every, Observer, Simulation, run_together
 from rigidmd.scene import MolecularScene, Scene
@@ -939,6 +942,23 @@ def test_a_signal_stops_with_a_summary_and_its_code(number, code, tmp_path):
     assert json.loads((folder / "summary.json").read_text())["interrupted"]
     assert (folder / "final.npz").exists()
     assert frames_in(folder) >= 1
+
+
+def test_compiling_is_announced_without_a_terminal(tmp_path, monkeypatch, capsys):
+    """A run that waits for the compiler says so, once."""
+    prepare = MolecularRun.prepare
+    index = CacheIndex(str(tmp_path), "kernel", 0)
+
+    def compile_first(run):
+        for n in (1, 2):
+            assert index.load(((numba.types.UniTuple(numba.types.float64, n),), ())) is None
+        prepare(run)
+
+    monkeypatch.setattr(MolecularRun, "prepare", compile_first)
+    scene = [str(ROOT / "systems" / "argon.toml"), "--set", "stages.0.duration_ps=0.01"]
+    assert main(["run", *scene, "-o", str(tmp_path / "out")]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len([line for line in lines if "compiling (" in line]) == 1
 
 
 def test_a_signal_of_the_program_s_own_is_left_to_it():

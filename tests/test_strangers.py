@@ -513,10 +513,15 @@ def hostile(tmp_path_factory):
     return folder
 
 
-def command_in(folder, *words):
+def command_in(folder, *words, **environment):
     """A command as the program `rigidmd` runs it, which does not put the working directory on the search path."""
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "rigidmd", *words], cwd=folder, capture_output=True, text=True, timeout=300
+        [sys.executable, "-P", "-m", "rigidmd", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        env=os.environ | environment,
     )
     assert done.returncode == 0, done.stderr
     return done.stderr
@@ -535,6 +540,58 @@ def test_nothing_in_the_working_directory_is_executed_or_obeyed(hostile, tmp_pat
     assert len(same) >= 3
     for name in same:
         assert (hostile / "run" / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
+
+
+LIQUID = """
+seed = 5
+[[molecules]]
+model = "argon"
+count = 60
+[box]
+density_g_cm3 = 1.2
+[forces]
+cutoff_A = 6.0
+[start]
+temperature_K = 90.0
+[[stages]]
+ensemble = "nvt"
+temperature_K = 90.0
+duration_ps = 1.0
+[output]
+log_interval_ps = 0.02
+trajectory_interval_ps = 0.02
+"""
+
+
+def run_and_analyse(folder, **environment):
+    """A short run of a liquid in a folder, with all analyses that it allows."""
+    (folder / "liquid.toml").write_text(LIQUID)
+    command_in(folder, "run", "liquid.toml", "-o", "liquid", **environment)
+    command_in(folder, "analyse", "liquid", "--only", "rdf,msd", **environment)
+    return {
+        path.name: path.read_bytes()
+        for path in (folder / "liquid").iterdir()
+        if path.suffix in (".png", ".csv", ".xtc", ".gro")
+    }
+
+
+@pytest.mark.timeout(600)
+def test_analyses_execute_and_obey_nothing_in_the_working_directory(hostile, tmp_path):
+    expected = run_and_analyse(tmp_path)
+    assert {"rdf.csv", "msd.csv", "log.csv"} <= expected.keys()
+    assert run_and_analyse(hostile) == expected
+    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
+
+
+@pytest.mark.soak
+def test_a_liquid_is_compiled_by_nothing_in_the_working_directory(hostile, tmp_path):
+    """From an empty cache, which a second process helps to fill."""
+    warm = run_and_analyse(tmp_path)
+    shutil.rmtree(hostile / "liquid", ignore_errors=True)
+    cold = run_and_analyse(hostile, RIGIDMD_CACHE=str(tmp_path / "cache"), RIGIDMD_COMPILERS="2")
+    assert any((tmp_path / "cache").rglob("*.nbc"))
+    assert cold == warm
+    assert not (hostile / "MARK").exists(), (hostile / "MARK").read_text()
 
 
 def test_the_second_compiling_process_imports_nothing_from_the_working_directory(hostile):

@@ -32,7 +32,10 @@ PAST = {
         "a new field as a file of the package",
     ),
     "test_forces.py": (["rigidmd.compile", "rigidmd.forces"], "a new pair potential as a file of the package"),
-    "test_run.py": (["rigidmd.commands.arguments"], "a command in a file of its own"),
+    "test_run.py": (
+        ["rigidmd.commands.arguments", "rigidmd.compile.cache"],
+        "a command in a file of its own, and a compiler that is called",
+    ),
     "test_strangers.py": (
         ["rigidmd.core.process", "rigidmd.compile", "rigidmd.scene.models"],
         "scripts in little memory, and processes in a hostile folder, which load nothing else",

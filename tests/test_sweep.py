@@ -522,6 +522,12 @@ def test_from_python(argon, finished, copied):
     assert list(found.to_dataframe()["runs"]) == [2, 2]
     with pytest.raises(KeyError, match="there are"):
         found["no"]
+    shown = found._repr_html_()
+    temperatures = [row["Temperature (K)"] for row in table(finished)]
+    for text in ("start.temperature_K", "<td>120</td>", "Temperature (K)", *(x.split(".")[0] for x in temperatures)):
+        assert text in shown
+    with pytest.raises(OutputError, match="pmf needs a sweep over the distance of a restraint"):
+        rigidmd.pmf(found)
 
 
 # Stops

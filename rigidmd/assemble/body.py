@@ -12,6 +12,7 @@ from rigidmd.assemble.plausibility import body_warnings
 from rigidmd.core.integrators import SCHEMES, SOLVERS
 from rigidmd.core.state import State, state_of
 from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.engines.body_motion import energies
 from rigidmd.engines.body_system import BodySystem, Pose
 from rigidmd.errors import SceneError
 from rigidmd.forces.body.applied import PythonForce, SteadyForce, TimeDependentForce
@@ -73,6 +74,9 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
         mass=mass, axes=axes, inertia=moments, centre=centre, points=points, point_names=names, applied=applied,
         warnings=body_warnings(scene),
     )  # fmt: skip
+    if not has_finite_energy(system):
+        reason = "are too large for floating-point numbers"
+        raise SceneError(scene.source, [f"the energy at the start: mass, moments of inertia or rates {reason}"])
     if scene.output.trajectory and system.translates:
         form = not_none(format_of(not_none(scene.output.topology)))
         if form.exceeded(system.site_positions(system.state)) is not None:
@@ -81,6 +85,13 @@ def build_body(scene: BodyScene, applied: dict[str, Callable[[Pose], tuple]] | N
             advice = "set output.trajectory_A_per_m to less, or output.trajectory = false"
             raise SceneError(scene.source, [f"{fault}: {advice}"])
     return system
+
+
+def has_finite_energy(system: BodySystem) -> bool:
+    """Whether the energies of a body at its start are numbers."""
+    times, states = system.state.time[:1], State(*(array[None] for array in system.state))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return all(bool(np.isfinite(values).all()) for values in energies(system, times, states).values())
 
 
 def _first_state(scene, body, moments, axes, attitude, spin, rotates) -> State:

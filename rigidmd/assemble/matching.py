@@ -2,14 +2,12 @@
 
 from collections import Counter, deque
 from collections.abc import Collection
-from functools import cache
 from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidmd.assemble.assignment import (
-    BOND_REACH,
     EQUAL_OF_RADIUS,
     Assignment,
     Orders,
@@ -19,19 +17,15 @@ from rigidmd.assemble.assignment import (
     massive_sites,
     numbered,
 )
-from rigidmd.io.formats.atoms import CHARMM_IONS, CHARMM_WATER, SAME_MASS, Atoms, element_of, is_element
-from rigidmd.io.formats.bonds import shortest_links
-from rigidmd.io.formats.cells import make_whole, pairs_within
+from rigidmd.assemble.atom_kinds import kinds_of, labels_of
+from rigidmd.assemble.bonded_atoms import bonded_atoms
+from rigidmd.io.formats.atoms import Atoms
+from rigidmd.io.formats.cells import make_whole
 from rigidmd.scene.models import Molecule
 
-#: Two ways along bonds that end this close, relative to a bond, end at the same image of an atom.
-SAME_PLACE = 1e-3
-#: u; programs without massless sites give them a mass below this.
-NO_MASS = 0.1
 #: Up to this multiple of the tolerance the best order of atoms is searched, for messages on molecules that do not fit.
 SEARCH_TOLERANCE = 3
 MOST_SEARCHED = 5  # of these molecules
-UNKNOWN = "X?"  # the kind of an atom with mass that is one of several sites without elements
 MOST_LISTED = 6  # atoms of a molecule in a message
 #: If two species fit, the better one is taken if its rms deviation is less than this fraction of the other's: as models
 #: of water that differ, a .gro has 0.004 and 0.05 Å.
@@ -57,14 +51,14 @@ def match(
 ) -> MatchedMolecules | list[str]:
     """The molecules that the atoms form, or error messages. The cell (3, 3), if any, has faces across which molecules
     may be split; tolerance: see Scene.structure."""
-    kinds = _kinds(atoms, species)
+    kinds = kinds_of(atoms, species)
     matcher = _Matcher(atoms, kinds, species, cell, tolerance)
     runs = [list(run) for _, run in groupby(range(len(kinds)), key=lambda i: atoms.residue[i])]
     by_residue = matcher.match(runs, "") if atoms.residue[0] else []
     if isinstance(by_residue, MatchedMolecules):
         numbers = [atoms.residue[run[0]][0] for run in runs]
         return by_residue if None in numbers else by_residue._replace(number=np.array(numbers))
-    runs_by_bonds, endless = _bonded(atoms, kinds, species, cell)
+    runs_by_bonds, endless = bonded_atoms(atoms, kinds, species, cell)
     by_bonds = matcher.match(runs_by_bonds, ", by bonding distance", endless)
     if isinstance(by_bonds, MatchedMolecules):
         note = "its residues are not the molecules of the scene, which were found by bonding distance"
@@ -72,7 +66,7 @@ def match(
         return by_bonds
     if by_residue and len(runs) > 1:
         return by_residue
-    known = {"X"}.union(*map(_labels, species))
+    known = {"X"}.union(*map(labels_of, species))
     if unknown := sorted({name for name, kind in zip(atoms.names, kinds, strict=True) if kind not in known}):
         names = ", ".join(name or "(no name)" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
         wanted = ", ".join(f"{molecule.name} ({_composition(molecule)})" for molecule in species)
@@ -93,129 +87,6 @@ def refit(
         for array, values in zip(fit, fit_template(points, species[k]), strict=True):
             array[members] = values
     return matched._replace(fit=fit)
-
-
-def _labels(molecule: Molecule) -> list[str]:
-    """Label of each site: its element, else its name. Atoms with the same label are interchangeable."""
-    return [e if e != "X" else name for e, name in zip(molecule.elements, molecule.site_names, strict=True)]
-
-
-def _kinds(atoms: Atoms, species: list[Molecule]) -> list[str]:
-    """The label of every atom: its element, or the name of a site; X for massless ones. "?" marks a guess.
-
-    An element in the file is accepted. A name counts if it is the name of a site or begins with an element of the
-    scene. If the file has masses, names of sites and elements have priority over the mass, and the mass over the
-    beginning of any other name.
-    """
-    by_name, by_mass = {}, []
-    for molecule in species:
-        for name, label, mass in zip(molecule.site_names, _labels(molecule), molecule.masses, strict=True):
-            by_name.setdefault(name, set()).add(label if mass > 0 else "X")
-            by_mass += [(mass, label)] if mass > 0 else []
-    vocabulary = frozenset(label for _, label in by_mass)
-    open_names = {name for name, labels in by_name.items() if len(labels) > 1}
-    by_name = {name: labels.pop() for name, labels in by_name.items() if len(labels) == 1}
-    site_names = set(by_name) - vocabulary
-    points = {name: _labels(m)[0] for m in species if len(m.masses) == 1 for name in m.residue_names}
-    shared = {name for m in species if len(m.masses) > 1 for name in m.residue_names}
-    virtual = CHARMM_WATER[1] if set(CHARMM_WATER) <= set(atoms.names) else None
-    hydrogen = next((h for h in ("H", "D", "T") if h in vocabulary), "")
-
-    def isotope(element: str) -> str:
-        """The isotope of hydrogen in the scene, for others in the file: light water from a file of heavy water."""
-        return hydrogen if hydrogen and element in ("H", "D", "T") and element not in vocabulary else element
-
-    def without_element(mass: float) -> str:
-        """The site of this mass that has no element, such as a united atom; X, without mass, if there is none."""
-        near = {label for other, label in by_mass if abs(other - mass) <= SAME_MASS * mass and not is_element(label)}
-        return near.pop() if len(near) == 1 else UNKNOWN if near else "X"
-
-    @cache
-    def kind(name: str, element: str, mass: float, residue: str | None) -> str:
-        if 0 < mass < NO_MASS:
-            return "X"
-        if mass > 0:
-            if name == "X":
-                return without_element(mass)
-            if isotope(name) in vocabulary:
-                return isotope(name)
-            if name in site_names:
-                return by_name[name]
-            nearest, label = min(by_mass, key=lambda entry: abs(entry[0] - mass))
-            if abs(nearest - mass) <= SAME_MASS * mass:
-                return label
-            if (guess := isotope(element_of(name, vocabulary))) in vocabulary:
-                return guess
-        if not element or element == "X":
-            if name in site_names:
-                return by_name[name]
-            if name in vocabulary:
-                return name
-        if name == virtual:
-            return "X"
-        if element:
-            return isotope(element)
-        if name in open_names:
-            return f"{name}?"
-        if residue in points and residue not in shared:
-            return points[residue]
-        if residue in (None, name):  # an ion or a noble gas: NA, CL, AR, SOD
-            ion = CHARMM_IONS.get(name.upper(), "")
-            name = ion if ion in vocabulary else name if residue is None else name.capitalize()
-        guess = isotope(element_of(name, vocabulary))
-        return guess if guess in vocabulary or guess == "X" else f"{guess or name or 'nameless'}?"
-
-    masses = np.zeros(len(atoms.names)) if atoms.masses is None else atoms.masses
-    residues = [residue[1] if residue else None for residue in atoms.residue]
-    return [kind(*atom) for atom in zip(atoms.names, atoms.elements, masses.tolist(), residues, strict=True)]
-
-
-def _bonded(
-    atoms: Atoms, kinds: list[str], species: list[Molecule], cell: np.ndarray | None
-) -> tuple[list[list[int]], set[int]]:
-    """Groups of atoms with mass, in file order, linked by bonds as long as in the templates' spanning trees, and the
-    first atoms of groups without an end: bonded to their own images, as in polymers."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    numbers = {kind: k for k, kind in enumerate({*kinds}.union(*map(_labels, species)))}
-    reach = np.zeros((len(numbers), len(numbers)))
-    for molecule in species:
-        sites = massive_sites(molecule)
-        points = molecule.positions_body[sites]
-        number = [numbers[_labels(molecule)[s]] for s in sites]
-        for i, j in shortest_links(points):
-            one, other, length = number[i], number[j], float(np.linalg.norm(points[i] - points[j]))
-            reach[one, other] = reach[other, one] = max(reach[one, other], BOND_REACH * length)
-    if UNKNOWN in numbers:
-        sites = [number for kind, number in numbers.items() if kind != UNKNOWN and not is_element(kind)]
-        longest = reach[np.ix_(sites, sites)].max(initial=0.0)
-        reach[numbers[UNKNOWN], [*sites, numbers[UNKNOWN]]] = longest
-        reach[[*sites, numbers[UNKNOWN]], numbers[UNKNOWN]] = longest
-    with_mass = np.array([i for i, kind in enumerate(kinds) if kind != "X"], int)
-    number = np.array([numbers[kinds[i]] for i in with_mass], int)
-    i, j, step = pairs_within(atoms.position[with_mass], cell, reach.max())
-    bonded = np.linalg.norm(step, axis=1) <= reach[number[i], number[j]]
-    i, j, step = i[bonded], j[bonded], step[bonded]
-    shape = (len(with_mass), len(with_mass))
-    count, label = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=shape), directed=False)
-    runs = [[] for _ in range(count)]
-    for atom, component in zip(with_mass, label, strict=True):
-        runs[component].append(atom)
-    endless = set() if cell is None else {runs[c][0] for c in _endless(label, i, j, step)}
-    return sorted(runs), endless
-
-
-def _endless(label: np.ndarray, i: np.ndarray, j: np.ndarray, step: np.ndarray) -> set[int]:
-    """Components (labels of atoms) whose bonds i, j with vectors step (b, 3) close a ring through the periodic cell."""
-    i, j, step = np.append(i, j), np.append(j, i), np.vstack([step, -step])
-    position, reached = np.zeros((len(label), 3)), np.zeros(len(label), bool)
-    reached[np.unique(label, return_index=True)[1]] = True
-    while len(onward := np.flatnonzero(reached[i] & ~reached[j])):
-        position[j[onward]] = position[i[onward]] + step[onward]
-        reached[j[onward]] = True
-    gap = np.linalg.norm(position[i] + step - position[j], axis=1)
-    return set(label[i[gap > SAME_PLACE * np.linalg.norm(step, axis=1)]].tolist())
 
 
 class _Candidate(NamedTuple):
@@ -416,14 +287,14 @@ def _formula(elements) -> str:
 
 
 def _composition(molecule: Molecule) -> str:
-    return _formula(_labels(molecule)[i] for i in massive_sites(molecule))
+    return _formula(labels_of(molecule)[i] for i in massive_sites(molecule))
 
 
 def _candidate(names: tuple, kinds: tuple, molecule: Molecule, k: int) -> _Candidate | None:
     """A run of atoms as a molecule of this species, or None. Atoms are assigned by names that occur as often among the
     atoms as among the sites, else by element. The order of atoms with the same name follows from the geometry."""
     sites = massive_sites(molecule)
-    labels = _labels(molecule)
+    labels = labels_of(molecule)
     wanted = [(molecule.site_names[s], labels[s]) for s in sites]
     if names == molecule.site_names and all(kinds[s] == labels[s] or kinds[s].endswith("?") for s in sites):
         # as in the files of a run, also if several sites have the same name

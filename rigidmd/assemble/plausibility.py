@@ -1,10 +1,10 @@
 """Numbers of a scene that are possible and probably in another unit, or of another quantity.
 
-A table has the limits of each quantity, with the likely cause on either side. A number outside them is a warning; those
-that no scene can mean are errors.
+Two tables have limits of quantities with the likely causes of numbers outside them: `PLAUSIBLE` of
+numbers that are warned of, `REFUSED` of numbers that no scene can mean.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from math import degrees, inf, pi
 from typing import Any, NamedTuple
 
@@ -24,7 +24,6 @@ SHORTEST_CUTOFF = 0.5
 LIGHTEST, HEAVIEST, HYDROGENS = 0.85, 1.1, 4.1
 #: Angles (degrees) that are a multiple of this in radians, to this many degrees, are probably in radians.
 ROUND_ANGLE, ROUNDED = 5.0, 0.4
-HEAVIEST_ELEMENT = 300.0  # u
 ATMOSPHERE_PA, TO_ATMOSPHERE = 101325.0, 0.03
 COLDEST_LIQUID = 100.0  # K, of water that starts without a file
 
@@ -37,11 +36,20 @@ class Quantity(NamedTuple):
     most: float
     if_small: str = ""
     if_large: str = ""
-    refused: bool = False  # whether values above `most` are errors
+    heaviest_site: float = inf  # u, of models for which the limits hold: those of atoms
+
+    def outside(self, value: float, where: str) -> str:
+        """A sentence on a value outside the limits; empty for a plausible one and for 0."""
+        size = abs(value)
+        if size == 0 or self.least <= size <= self.most:
+            return ""
+        bound, limit, cause = "below", self.least, self.if_small
+        if size > self.most:
+            bound, limit, cause = "above", self.most, self.if_large
+        return f"{where} is {value:.4g} {self.unit}, {bound} {limit:g}: {cause}"
 
 
-QUANTITIES = {
-    "density": Quantity("g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", refused=True),
+PLAUSIBLE = {
     "nearest distance": Quantity("Å", 0.5, 15.0, "are the positions in nm?", "are the positions in pm?"),
     "largest sigma_A": Quantity("Å", 0.9, 15.0, "is it in nm?", "is it in pm?"),
     "largest epsilon": Quantity("kJ/mol", 0.0, 40.0, "", "is it in J/mol or in K?"),
@@ -54,15 +62,9 @@ QUANTITIES = {
 }  # fmt: skip
 
 
-def outside(name: str, value: float, where: str) -> tuple[str, bool] | None:
-    """A sentence on a value outside the limits of its quantity, and whether it is refused."""
-    limits, size = QUANTITIES[name], abs(value)
-    if size == 0 or limits.least <= size <= limits.most:
-        return None
-    bound, cause = ("below", limits.if_small) if size < limits.least else ("above", limits.if_large)
-    limit = limits.least if size < limits.least else limits.most
-    text = f"{where} is {value:.4g} {limits.unit}, {bound} {limit:g}: {cause}"
-    return text, limits.refused and size > limits.most
+REFUSED = {
+    "density": Quantity("g/cm³", 0.0, 25.0, "", "is it in kg/m³, or an edge in nm?", heaviest_site=300.0),
+}
 
 
 def scene_errors(scene: MolecularScene, species: list[Molecule], counts: np.ndarray, space: Space) -> list[str]:
@@ -70,10 +72,11 @@ def scene_errors(scene: MolecularScene, species: list[Molecule], counts: np.ndar
     mass = float(counts @ np.array([m.mass for m in species]))
     density = 0.0 if space.volume == inf else mass / space.volume / GRAM_PER_CM3
     key = "box.density_g_cm3" if scene.box.density_g_cm3 is not None else "the density of the box"
-    found = outside("density", scene.box.density_g_cm3 or density, key)
-    if max(m.masses.max() for m in species) > HEAVIEST_ELEMENT:
-        found = None  # sites of a model that is not of atoms
-    faults = [found[0]] if found is not None and found[1] else []
+    values = {"density": (scene.box.density_g_cm3 or density, key)}
+    heaviest = max(m.masses.max() for m in species)
+    limits = {name: limit for name, limit in REFUSED.items() if heaviest <= limit.heaviest_site}
+    found = (limit.outside(*values[name]) for name, limit in limits.items())
+    faults = [*filter(None, found)]
     contact = shortest_contact(species)
     cutoff = scene.forces.cutoff_A
     if cutoff is not None and scene.forces.lennard_jones and cutoff < SHORTEST_CUTOFF * contact < inf:
@@ -98,8 +101,7 @@ def shortest_contact(species: list[Molecule]) -> float:
 
 def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
     """Warnings of numbers that are probably in another unit."""
-    found = [*_scene_values(scene)]
-    warnings = [sentence[0] for each in found if (sentence := outside(*each)) is not None and not sentence[1]]
+    warnings = _implausible(_scene_values(scene))
     for entry, m in zip(scene.molecules, species, strict=True):
         if entry.model is None or entry.masses_u is not None:  # the shipped models are right
             warnings += molecule_warnings(m)
@@ -118,6 +120,12 @@ def scene_warnings(scene: MolecularScene, species: list[Molecule]) -> list[str]:
     return warnings + ([] if gravity is None else gravity_warnings("fields.gravity_m_s2", gravity))
 
 
+def _implausible(values: Iterable[tuple[str, float, str]]) -> list[str]:
+    """Sentences on values outside the limits of `PLAUSIBLE`: quantity, value and where it stands."""
+    found = (PLAUSIBLE[name].outside(value, where) for name, value, where in values)
+    return [*dict.fromkeys(filter(None, found))]
+
+
 def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
     """Quantity, value and key of numbers of a scene that do not depend on its molecules."""
     for k, stage in enumerate(scene.stages):
@@ -134,8 +142,7 @@ def _scene_values(scene: MolecularScene) -> Iterator[tuple[str, float, str]]:
 
 def molecule_warnings(m: Molecule) -> list[str]:
     """Warnings of numbers of a molecule that are probably in another unit."""
-    found = [sentence[0] for each in _molecule_values(m) if (sentence := outside(*each)) is not None]
-    return list(dict.fromkeys(found)) + _mass_warnings(m)
+    return _implausible(_molecule_values(m)) + _mass_warnings(m)
 
 
 def _molecule_values(m: Molecule) -> Iterator[tuple[str, float, str]]:
@@ -169,8 +176,7 @@ def _mass_warnings(m: Molecule) -> list[str]:
 def gravity_warnings(key: str, acceleration: tuple[float, float, float]) -> list[str]:
     """Warnings of gravity that points upwards or is in another unit."""
     size = float(np.linalg.norm(acceleration))
-    found = outside("gravity", size, key)
-    warnings = [] if found is None else [found[0]]
+    warnings = _implausible([("gravity", size, key)])
     if acceleration[2] > 0.9 * size:
         warnings.append(f"{key} points up, along +z: should it be [0, 0, {-acceleration[2]:g}]?")
     return warnings

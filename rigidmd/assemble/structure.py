@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.assemble.assignment import massive_sites
-from rigidmd.assemble.matching import NO_MASS, MatchedMolecules, match
+from rigidmd.assemble.atom_kinds import NO_MASS
+from rigidmd.assemble.matching import MatchedMolecules, match
 from rigidmd.assemble.memory_check import check_memory_of_molecules
 from rigidmd.core.state import edges_and_angles
 from rigidmd.core.state_file import read_state
@@ -23,15 +24,13 @@ from rigidmd.io.formats.cells import (
 from rigidmd.io.formats import has_types
 from rigidmd.io.structure_file import read_atoms
 from rigidmd.scene.models import Molecule
-from rigidmd.scene.validation import did_you_mean, not_none
+from rigidmd.scene.validation import OTHER_UNITS, did_you_mean, not_none
 
 MOST_NAMED = 5  # molecules named in a message; further ones are counted
 ROUNDING = 1e-12  # of a rotated cell, relative to its longest edge
 SAME_BOX = 1e-4  # relative difference between the boxes of file and scene that rounding in files explains
 #: Masses, moments and numbers of sites of one model agree to this fraction.
 SAME_MODEL = 1e-6
-#: Units (Å) in which coordinates are sometimes given in error.
-OTHER_UNITS = {"nm": 10.0, "bohr": 0.529177210903, "pm": 0.01}
 CLOSE = 1.2  # factor by which nearest distances may differ from the bonds of the templates
 
 
@@ -250,7 +249,7 @@ def _other_units(atoms: Atoms, species: list[Molecule]) -> list[str]:
         return []
     nearest = float(np.median(KDTree(atoms.position).query(atoms.position, 2)[0][:, 1]))
     low, high = min(bonds) / CLOSE, max(bonds) * CLOSE
-    fitting = [unit for unit, size in ({"Å": 1.0} | OTHER_UNITS).items() if low <= nearest * size <= high]
+    fitting = [unit for unit, size in OTHER_UNITS["A"].items() if low <= nearest * size <= high]
     return [
         f"the coordinates seem to be in {unit}, not in Å as in this format: the nearest distance is {nearest:.3g}"
         for unit in fitting

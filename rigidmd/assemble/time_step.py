@@ -5,7 +5,7 @@ A motion of angular frequency w has the rms amplitude sqrt(kT/m)/w at a temperat
 motions of molecules in liquids are much alike, so w follows from masses, moments of inertia and temperature.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from math import inf, sqrt
 from operator import attrgetter
@@ -84,6 +84,10 @@ class FastMotion(NamedTuple):
     molecule: str
     does: str  # "moves" or "rotates ..."
 
+    def longest_step(self, stage: Stage) -> float:
+        """The longest stable step of a stage for this motion, ps."""
+        return stable_angle(stage.scheme) * self.time
+
 
 def fastest_motion(species: list[Molecule], temperature: float) -> FastMotion | None:
     """The fastest motion at a temperature, K; None without molecules or temperature."""
@@ -115,23 +119,34 @@ def step_warnings(scene: MolecularScene) -> list[str]:
     warnings, forces = [], scene.forces
     ends = forces.cutoff_A is not None or scene.box.periodic
     jumps = ends and forces.lennard_jones and forces.truncation in ("plain", "shift")
-    species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
-    for k, stage, temperature in _given_steps(scene):
+    for k, stage, _ in _given_steps(scene):
         if (order := stage.scheme.order) > 2 and jumps:
             lost = f"lost where forces jump to 0 at the cutoff, as with forces.truncation = {forces.truncation!r}"
             advice = "Use truncation = 'smooth_switch'"
             warnings.append(f"stages.{k}: {stage.integrator} is of order {order}, {lost}. {advice}")
-        if (fastest := fastest_motion(species, temperature)) is None or not scene.watch.stable_step:
+    return [*warnings, *_sentences_on_steps(scene, _step_warning)]
+
+
+def accuracy_warnings(scene: MolecularScene) -> list[str]:
+    """Those of `step_warnings` on steps that are stable and inaccurate, which a run does not notice."""
+    return [*_sentences_on_steps(scene, _accuracy_warning)]
+
+
+def _sentences_on_steps(scene: MolecularScene, about: Callable[[Stage, FastMotion, float], str]) -> Iterator[str]:
+    """What a function writes on the step of each stage, if the scene watches steps."""
+    species = [m for m, entry in zip(species_of(scene), scene.molecules, strict=True) if entry.frozen is not True]
+    for k, stage, temperature in _given_steps(scene):
+        fastest = fastest_motion(species, temperature)
+        if fastest is None or not scene.watch.stable_step:
             continue
-        if sentence := _step_warning(stage, fastest, temperature):
-            warnings.append(f"stages.{k}: timestep_fs = {stage.timestep_fs:g} {sentence}")
-    return warnings
+        if sentence := about(stage, fastest, temperature):
+            yield f"stages.{k}: timestep_fs = {stage.timestep_fs:g} {sentence}"
 
 
 def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
     """What is wrong with the step of a stage for a motion at a temperature, K; empty if nothing is."""
     time, size, unit, name, does = fastest
-    longest, dt = stable_angle(stage.scheme) * time, stage.timestep_fs * FEMTOSECOND
+    longest, dt = fastest.longest_step(stage), stage.timestep_fs * FEMTOSECOND
     limit = f"{longest / FEMTOSECOND:.3g} fs"
     if dt > longest:
         return (
@@ -139,19 +154,29 @@ def _step_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
             f"{stage.integrator} is stable up to {limit} where, as in liquids, the stiffest motions swing by {size:g} "
             f"{unit}"
         )
-    # hybrid Monte Carlo corrects the error of its steps
-    if (error := step_error(stage.scheme, dt / time)) > INACCURATE and not stage.is_hybrid:
-        better = dt
-        while step_error(stage.scheme, better / time) > INACCURATE / 2:
-            better *= 0.95
-        return (
-            f"is inaccurate for {name} at {temperature:g} K: it {does} as if forces were wrong by {error:.0%}, which "
-            f"shifts temperatures and averages. At {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
-        )
+    if sentence := _accuracy_warning(stage, fastest, temperature):
+        return sentence
     if longest < inf and dt * NEEDLESS < longest:
         cause = "is it in ps?" if dt * 1000 * NEEDLESS >= longest else "is it in another unit?"
         return f"is {longest / dt:.0f} times shorter than {stage.integrator} needs for {name}, {limit}: {cause}"
     return ""
+
+
+def _accuracy_warning(stage: Stage, fastest: FastMotion, temperature: float) -> str:
+    """Like `_step_warning`, of steps that are stable and have large errors."""
+    dt, limit = stage.timestep_fs * FEMTOSECOND, fastest.longest_step(stage)
+    error = step_error(stage.scheme, dt / fastest.time)
+    # hybrid Monte Carlo corrects the error of its steps
+    if dt > limit or error <= INACCURATE or stage.is_hybrid:
+        return ""
+    better = dt
+    while step_error(stage.scheme, better / fastest.time) > INACCURATE / 2:
+        better *= 0.95
+    return (
+        f"is inaccurate for {fastest.molecule} at {temperature:g} K: it {fastest.does} as if forces were "
+        f"wrong by {error:.0%}, which shifts temperatures and averages. "
+        f"At {better / FEMTOSECOND:.2g} fs it is {INACCURATE / 2:.0%}"
+    )
 
 
 def precision_for(error: float) -> Literal["double", "mixed"]:

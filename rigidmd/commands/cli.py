@@ -36,8 +36,11 @@ EXAMPLES = """examples:
 class CommandLine(Wording):
     """How messages name the options of the command line."""
 
+    #: Those that are not the keyword of Python with dashes.
+    arguments = {"folder": "-o", "file": "-o", "overrides": "--set", "sets": "--set"}  # noqa: RUF012
+
     def option(self, name: str) -> str:
-        return "-o" if name in ("folder", "file") else f"--{name.replace('_', '-')}"
+        return self.arguments.get(name) or f"--{name.replace('_', '-')}"
 
     def resume(self, folder: Path) -> str:
         return f"`rigidmd resume {shlex.quote(str(folder))}`"

@@ -23,6 +23,7 @@ from rigidmd.errors import MoleculeError
     argument("--force", action="store_true", help="replace that file"),
 )  # fmt: skip
 def _models(options: Options) -> int:
+    from rigidmd.assemble.plausibility import molecule_warnings
     from rigidmd.scene.models import available_models, load_model, read_molecule
     from rigidmd.view.molecule_figure import models_table, molecule_text, write_molecule_figure
 
@@ -39,6 +40,8 @@ def _models(options: Options) -> int:
         print("\n`rigidmd models NAME` shows one in full; --draw draws it")
         return 0
     found = read_molecule(Path(options.model)) if options.model.endswith(".toml") else load_model(options.model)
+    for warning in molecule_warnings(found) if options.model.endswith(".toml") else ():
+        warn(warning)
     if not draws:
         print(molecule_text(found))
         return 0
@@ -50,6 +53,7 @@ def _models(options: Options) -> int:
 
 def _write_model(options: Options) -> int:
     """`models --from`."""
+    from rigidmd.assemble.plausibility import molecule_warnings
     from rigidmd.assemble.species import model_from_geometry
     from rigidmd.io.scene_file import write_model
     from rigidmd.io.write import check_target
@@ -65,7 +69,7 @@ def _write_model(options: Options) -> int:
     check_target(path, (".toml",), options.force, "model", [geometry, *([parameters] if parameters else [])])
     write_model(path, file)
     print(f"{path}: {found.name}, {found.description}; {file.source}")
-    for note in notes:
+    for note in [*notes, *molecule_warnings(found)]:
         warn(note)
     print("next:")
     print(f"  rigidmd models {shlex.quote(str(path))}    shows it; --draw draws it")

@@ -120,6 +120,7 @@ class AppendedFile:
     def __init__(self, path: Path, kept: Sequence[int] | None = None, patched: tuple[int, bytes] = (0, b"")):
         self._path = path
         self._size, self._sum = (0, 0) if kept is None else kept
+        self._is_whole = True  # whether each record was appended to all records before it
         with writing(path, "written" if kept is None else "read"):
             if kept is None:
                 create_empty_file(path)
@@ -154,12 +155,13 @@ class AppendedFile:
             raise LostFileError(f"{self._path} was removed while the run was writing it") from None
         if (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino):
             raise LostFileError(f"{self._path} was replaced by another file while the run was writing it")
-        if ours.st_size != self._size:
+        if not self._is_whole or ours.st_size != self._size:
             raise LostFileError(f"{self._path} was changed by another program while the run was writing it")
 
     def append(self, piece: bytes) -> None:
-        """Append a record."""
+        """Append a record. A file that another program has cut is known to `check`."""
         with writing(self._path):
+            self._is_whole &= os.fstat(self._file.fileno()).st_size == self._size
             try:
                 self._write(piece)
             except OSError:

@@ -37,7 +37,11 @@ class Sites(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """The molecules that a scene describes and the forces on them. Constant during a run; `state` is the start."""
+    """The molecules that a scene describes and the forces on them, which are constant during a run.
+
+    `state` is the start, of which every run takes a copy. It is not for changes, although engines need
+    it writable: `Simulation.start_from` checks another one.
+    """
 
     scene: MolecularScene  # resolved: every default is filled in
     species: list[Molecule]

@@ -383,7 +383,9 @@ class TrajectoryFile(AppendedFile):
     def write(self, state: State, time: float, step: int) -> None:
         """Add a frame with its own time (ps) and the box."""
         positions = self._system.site_positions(state, self._wrapped)
-        _check_fits(self._path, positions.astype(np.float32), "output.trajectory", UNLIMITED)
+        with np.errstate(over="ignore"):  # infinite positions are beyond every limit
+            rounded = positions.astype(np.float32)
+        _check_fits(self._path, rounded, "output.trajectory", UNLIMITED)
         velocities = self._system.site_velocities(state) if self._velocities else None
         cell = state.cell if np.isfinite(state.cell).all() else None
         with writing(self._path):  # memory for the file of a frame may be insufficient

@@ -250,9 +250,9 @@ class BodyRun(RunPart):
         rate, angle = fastest_body_rate(system), stable_angle(system.method)
         if not self.scene.watch.stable_step or rate == 0 or angle == inf:  # some solvers choose their own steps
             return
-        stable = self.record.stable = angle / rate
-        if run.timestep_s > stable:
-            self.simulation.note(*body_step_warnings(system))
+        self.record.stable = angle / rate
+        for sentence in body_step_warnings(system):
+            self.simulation.note(sentence)
 
     def durations(self) -> list[float]:
         return [segment.steps * segment.dt for segment in self._segments]

@@ -10,27 +10,27 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from rigidmd.assemble.build import build, integrator_of_stage
-from rigidmd.assemble.time_step import stable_angle
+from rigidmd.assemble.time_step import accuracy_warnings, stable_angle
 from rigidmd.assemble.user_code.binding import user_errors_explained
 from rigidmd.assemble.user_code.compiled import check_compiled_code
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
-from rigidmd.core.state import NOW, ORIGIN, REMOVED, WORK, State, state_of
+from rigidmd.core.state import NOW, ORIGIN, REMOVED, State, state_of
 from rigidmd.dynamics.model import remove_momentum
 from rigidmd.dynamics.observables import largest_values
 from rigidmd.engines.observables import Observation, describe_quantities, observe
 from rigidmd.engines.protocol import Engine
-from rigidmd.engines.samples import OF_TRAJECTORIES, Samples, equilibrated
+from rigidmd.engines.samples import OF_TRAJECTORIES, Samples
 from rigidmd.engines.system import System
 from rigidmd.errors import EngineError, SceneError, SimulationError, StructureError
 from rigidmd.io.checkpoint import Checkpoint
 from rigidmd.io.formats import format_of
-from rigidmd.io.formats.cells import cell_of
 from rigidmd.io.formats.through_ase import atoms_of_system
 from rigidmd.io.progress import progress_of
 from rigidmd.io.scene_file import input_names
 from rigidmd.run import checks
 from rigidmd.run.force_errors import check_forces, coulomb_errors, velocity_notes
+from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.minimise import Enthalpy, OverlapRemoval, minimise, precision_of_minimisation, remove_overlaps
 from rigidmd.run.molecular_observers import FinalState, LogFile, PressureTensor, Sampler, StepWatch
 from rigidmd.run.observers import Figures, Frames, Moment, Observer, SceneFile
@@ -42,7 +42,6 @@ from rigidmd.run.schedule import Segment, interruptible
 from rigidmd.run.summary import Minimum, describe_minimum, summarise
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.stage import Stage
-from rigidmd.scene.validation import not_none
 from rigidmd.units import BOLTZMANN, FEMTOSECOND
 
 if TYPE_CHECKING:
@@ -61,26 +60,6 @@ class MolecularRecord(RunRecord):
     stable: dict[Count, PositiveFloat] = field(default_factory=dict)  # the longest stable step, ps
     moves: dict[Count, tuple[Count, Count]] = field(default_factory=dict)  # of the box, tried and accepted
     minima: dict[Count, Minimum] = field(default_factory=dict)
-
-
-def scale_to_mean_box(system: System, state: State, samples: Samples, k: int) -> None:
-    """Scale a state before stage k, in place, if this stage continues in the mean box of the stage before.
-
-    The box has the ratios of the mean edges and the mean angles of the equilibrated part of that stage, and its mean
-    volume. Centres of mass are scaled with it. Molecules do not rotate, and momenta do not change. The change of the
-    energy is added to the energy ledger as work.
-    """
-    if not k or not system.scene.stages[k].volume:
-        return
-    steady = equilibrated(samples.of_stage(k - 1), system.scene.stages[k - 1])
-    mean = not_none(cell_of([float(steady[name].mean()) for name in ("a", "b", "c", "alpha", "beta", "gamma")]))
-    cell = np.where(state.cell == 0, 0.0, mean)  # right angles stay exact
-    cell *= np.cbrt(1000 * steady["volume"].mean() / np.prod(np.diag(cell)))
-    engine = system.engine()
-    before = observe(system, engine, state, energy_unit=1.0).potential
-    state.position[:] = state.position @ np.tril(np.linalg.solve(state.cell, cell))
-    state.cell[:] = cell
-    state.energy_ledger[WORK] += observe(system, engine, state, energy_unit=1.0).potential - before
 
 
 #: States between the last good one and a failure that are searched for its cause.
@@ -179,7 +158,8 @@ class MolecularRun(RunPart):
                         method = self._integrator(k)
                         self.engine.advance(self._state_for(method), method, 0.0, 0)
         self.engine.forget()
-        for sentence in velocity_notes(self.system, self.state):
+        sentences = [*velocity_notes(self.system, self.state), *accuracy_warnings(self.scene)]
+        for sentence in sentences:
             self.simulation.note(sentence)
 
     def _remove_overlaps(self) -> None:
@@ -276,6 +256,8 @@ class MolecularRun(RunPart):
 
     def reenter_segment(self, k: int) -> Segment:
         stage, step = self.scene.stages[k], self.scene.stages[k].timestep_fs * FEMTOSECOND
+        for force in self.system.python_forces.values():
+            force.may_diverge = stage.is_hybrid
         if stage.is_minimisation:
             return Segment(stage.scheme, step, 0, action=None if k in self.record.minima else self._minimise)
         return Segment(self._integrator(k), step, stage.steps, together=stage.steps_together)

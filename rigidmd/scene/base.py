@@ -23,7 +23,7 @@ from rigidmd.errors import SceneError, option
 from rigidmd.io.formats import Format, format_of, written
 from rigidmd.scene.integrators import IntegratorRow, with_registered_rows
 from rigidmd.scene.validation import (
-    MOST_TABLES, Section, exact_names, is_within, location_of, numbers_out_of_range, validation_messages,
+    MOST_TABLES, Section, exact_names, is_within, location_of, numbers_out_of_range, setting, validation_messages,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ class Scene(Section, Displayed):
                 continue
             where, path = location_of(keys, text, overridden), folder / name
             if not (embedded_files or is_within(key, overridden) or is_inside(path, folder)):
-                advice = f"move it there, or set it by --set {key}=PATH"
+                advice = f"move it there, or set it by {setting(key, 'PATH')}"
                 faults.append(f"{where}: {shorten_repr(name)} is outside the scene's folder; {advice}")
             elif fault := unreadable_reason(path):
                 faults.append(f"{where}: {fault}: {shorten_repr(str(path))}{_similar_files(path)}")
@@ -341,7 +341,7 @@ def _removal_hint(fault: str, data: dict, overridden: Iterable[str]) -> str:
     tables = dict.fromkeys(["", *(f"{key.rpartition('.')[0]}." for key in overridden)]) if overridden else ()
     keys = [table + name for table in tables for name in names]
     there = [key for key in dict.fromkeys(keys) if key not in overridden and _has_key(data, key)]
-    return "".join(f"; --set {key}= removes it" for key in there)
+    return "".join(f"; {setting(key)} removes it" for key in there)
 
 
 def _has_key(data: Any, key: str) -> bool:
@@ -357,8 +357,9 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
     """Set one dotted key in nested tables and lists in place; None removes it. Returns the key, with numbers for names
     of entries of lists, and error messages."""
     *parents, last = key.split(".", DEEPEST + 1)
+    where = f"{option('overrides')} {key}"
     if len(parents) > DEEPEST:
-        return key, [f"--set {shorten_repr(key)}: is a key of more than {DEEPEST} parts"]
+        return key, [f"{option('overrides')} {shorten_repr(key)}: is a key of more than {DEEPEST} parts"]
     target: Any = data
     indices: list[Any] = []
     for depth, part in enumerate([*parents, last]):
@@ -373,12 +374,12 @@ def override(data: dict, key: str, value: Any) -> tuple[str, list[str]]:
                 number = names.index(part)
             if number is None or number >= len(target):
                 called = f" ({', '.join(map(shorten_repr, names))})" if number is None and any(names) else ""
-                return key, [f"--set {key}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"]
+                return key, [f"{where}: {here} has entries 0 to {len(target) - 1}{called}, not {part!r}"]
         elif not table:
-            return key, [f"--set {key}: {here} is not a table"]
+            return key, [f"{where}: {here} is not a table"]
         elif value is None and part not in target:
             there = did_you_mean(part, target) or f"; there are {', '.join(target)}"
-            return key, [f"--set {key}=: {here or 'the scene'} has no {part} to remove{there}"]
+            return key, [f"{setting(key)}: {here or 'the scene'} has no {part} to remove{there}"]
         index: Any = number if listed else part
         indices.append(index)
         if depth == len(parents) and value is None:

@@ -16,7 +16,7 @@ from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
 
 from rigidmd.core.plain_text import did_you_mean, plain_letters
 from rigidmd.core.toml import line_of, shorten_repr, shorten_text, values_in
-from rigidmd.errors import MOST_SHOWN
+from rigidmd.errors import MOST_SHOWN, option
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
@@ -144,9 +144,21 @@ def location_of(keys: list, text: str, overridden: Iterable[str] = ()) -> str:
     """Where a key of a scene is set: its line and name, or "--set KEY"."""
     path = ".".join(shorten_text(str(key)) for key in keys)
     if is_within(path, overridden):
-        return f"--set {path}"
+        return f"{option('overrides')} {path}"
     line = line_of(keys, text)
     return (f"line {line}: " if line else "") + (path or "scene")
+
+
+def setting(key: str, value: str = "", argument: str = "overrides") -> str:
+    """How a user sets a key, or removes it without a value: --set KEY=VALUE, in Python overrides={'KEY': VALUE}."""
+    if in_python():
+        return f"{argument}={{{key!r}: {value or None}}}"
+    return f"{option(argument)} {key}={value}"
+
+
+def in_python() -> bool:
+    """Whether messages are read by a user of Python, not of the command line."""
+    return not option("overrides").startswith("-")
 
 
 def is_within(path: str, keys: Iterable[str]) -> bool:
@@ -179,11 +191,12 @@ SENTENCES = {
 ADVICE = ": write "
 #: Number of a text with a unit, such as "1 ns".
 WITH_UNIT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zÅµ°/]*\d?)\s*")
+BOHR = 0.529177210903  # Å
 #: By the unit of a key, the sizes of other units in it.
 OTHER_UNITS = {
     "ps": {"fs": 1e-3, "ps": 1.0, "ns": 1e3, "us": 1e6, "µs": 1e6, "s": 1e12},
     "fs": {"as": 1e-3, "fs": 1.0, "ps": 1e3, "ns": 1e6, "s": 1e15},
-    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "nm": 10.0},
+    "A": {"pm": 1e-2, "A": 1.0, "Å": 1.0, "bohr": BOHR, "nm": 10.0},
     "K": {"K": 1.0},
     "bar": {"Pa": 1e-5, "kPa": 1e-2, "MPa": 10.0, "GPa": 1e4, "bar": 1.0, "kbar": 1e3, "atm": 1.01325},
     "kJ_mol": {"J/mol": 1e-3, "kJ/mol": 1.0, "kcal/mol": 4.184},

@@ -41,8 +41,8 @@ ZERO = 1e-8
 #: Largest error of w² as a fraction of the largest: beyond it forces jump where a pair passes the cutoff.
 LARGEST_ERROR = 1e-4
 SMOOTH = (
-    "where forces jump at the cutoff, --set forces.truncation=smooth_switch, and with PME or Ewald sums also --set "
-    "forces.ewald_accuracy=1e-7, make them smooth"
+    "where forces jump at the cutoff, forces.truncation = 'smooth_switch', and with PME or Ewald sums also "
+    "forces.ewald_accuracy = 1e-7, make them smooth"
 )
 #: Most coordinates of a complete spectrum by default: a matrix of them has 0.3 GB. Modes at each end beyond it.
 MOST_DENSE, COUNT = 6000, 20

@@ -52,7 +52,7 @@ TableRow = tuple[str, str]
 @html_of.register
 def scene_html(scene: Scene) -> str:
     kind = "one rigid body" if isinstance(scene, BodyScene) else "rigid molecules"
-    return _framed(scene.name, kind, _table(_rows(scene)))
+    return framed(scene.name, kind, _table(_rows(scene)))
 
 
 @html_of.register
@@ -65,7 +65,7 @@ def simulation_html(simulation: Simulation) -> str:
     rows += [("threads", str(simulation.threads)), ("writes to", where)]
     if names := [type(observer).__name__ for observer in simulation.observers]:
         rows.append(("observers", ", ".join(names)))
-    return _framed(simulation.scene.name, "ready to run: run() does it", _table(rows))
+    return framed(simulation.scene.name, "ready to run: run() does it", _table(rows))
 
 
 @html_of.register
@@ -82,7 +82,7 @@ def results_html(results: Results) -> str:
     left = f"{''.join(text)}{notes(summary['notes'])}"
     name, drawing = next(iter(drawn.items()), ("", None))
     right = _drawing(drawing, f"{results.system.scene.name}-{name}", f"figure: {name}")
-    return _framed(results.system.scene.name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
+    return framed(results.system.scene.name, results._summary_line, f"{_sides(left, right)}{_columns(results)}")
 
 
 @html_of.register
@@ -90,7 +90,7 @@ def analysis_html(result: AnalysisResult) -> str:
     rows = [(value.name, _measured(value), value.note) for value in result.values]
     right = _drawing(result.plot() if result.curves else None, f"analysis-{result.name}", result.about)
     left = f"{table([], rows, words=True)}{notes(result.notes)}"
-    return _framed(result.name, result.about, _sides(left, right))
+    return framed(result.name, result.about, _sides(left, right))
 
 
 def _measured(value: Value) -> str:
@@ -113,7 +113,8 @@ def _drawing(drawing: "Picture | None", salt: str, about: str) -> str:
     return f'<div class="{"paper" if "<image" in svg else "figure"}">{svg}</div>'
 
 
-def _framed(name: str, about: str, body: str) -> str:
+def framed(name: str, about: str, body: str) -> str:
+    """A block of HTML in the style of the package, with a name and what it is."""
     head = f'<div class="head">{html.escape(name)} <span class="faint">{html.escape(about)}</span></div>'
     return f'<style>{STYLE}</style><div class="rigidmd">{head}{body}</div>'
 

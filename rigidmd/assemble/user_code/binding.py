@@ -10,8 +10,9 @@ import numpy as np
 
 from rigidmd.assemble.defaults import with_momentum_removal
 from rigidmd.assemble.user_code.compiled import describe_compile_error
+from rigidmd.assemble.user_code.cutoffs import check_cutoff
 from rigidmd.assemble.user_code.force import BoundForce, Force, UserForceError, changes_momentum
-from rigidmd.assemble.user_code.pair_potential import PairLaw, check_cutoff, pair_law
+from rigidmd.assemble.user_code.pair_potential import PairLaw, pair_law
 from rigidmd.assemble.user_code.trust import trusted_module
 from rigidmd.core.plain_text import did_you_mean, distinct
 from rigidmd.dynamics.model import count_degrees_of_freedom

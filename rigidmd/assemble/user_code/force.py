@@ -36,6 +36,10 @@ class UserForceError(SimulationError):
     """A force of user code cannot be computed."""
 
 
+class NotFiniteError(UserForceError):
+    """A force of user code has values that are not finite."""
+
+
 class Force:
     """A force on molecules in plain Python: derive a class from it and define `on_sites` or `on_molecules`.
 
@@ -79,7 +83,11 @@ class BoundForce:
     """A `Force` in a system: calls it, checks the values, and converts forces on sites to forces on bodies.
 
     calls, seconds : how often it was called, and the time that this took
+    may_diverge : whether values that are not finite are passed to the steps, as in trajectories of
+        hybrid Monte Carlo, which are then rejected; else they are an error
     """
+
+    may_diverge = False
 
     def __init__(self, force: Force, name: str, system: System):
         self.force, self.name, self.system = force, name, system
@@ -94,6 +102,19 @@ class BoundForce:
     def __call__(self, workspace: PythonForcesWorkspace, state: State) -> None:
         """Fill a workspace with the forces at a state. Raises UserForceError."""
         began = clock.perf_counter()
+        try:
+            if self.may_diverge and not state.is_finite:
+                raise NotFiniteError(f"the force {self.name} is not known at this state")
+            self._evaluate(workspace, state)
+        except NotFiniteError:
+            if not self.may_diverge:
+                raise
+            for array in (workspace.force, workspace.torque_body, workspace.tally):
+                array[:] = np.nan
+        workspace.fresh[0] = 1
+        self.calls, self.seconds = self.calls + 1, self.seconds + clock.perf_counter() - began
+
+    def _evaluate(self, workspace: PythonForcesWorkspace, state: State) -> None:
         state = State(*(_read_only(array) for array in state))
         if self._by_site:
             energy, force, torque, virial = self._of_sites(_read_only(self.system.site_positions(state)), state)
@@ -103,14 +124,15 @@ class BoundForce:
         # points, which have no torques, may get those of molecules
         self._fill(workspace.torque_body, torque if len(state.rotation) else None, "torques")
         if not np.isfinite(energy):
-            raise self._error(f"the energy {energy}")
+            raise self._error(f"the energy {energy}", NotFiniteError)
         numbers = np.zeros((3, 3)) if virial is None else real_numbers(virial)
-        if numbers is None or numbers.shape != (3, 3) or not np.isfinite(numbers).all():
-            raise self._error(f"{virial!r:.60} as its virial, not (3, 3) finite numbers")
+        no_virial = f"{virial!r:.60} as its virial, not (3, 3) finite numbers"
+        if numbers is None or numbers.shape != (3, 3):
+            raise self._error(no_virial)
+        if not np.isfinite(numbers).all():
+            raise self._error(no_virial, NotFiniteError)
         workspace.tally[0] = energy * KJ_PER_MOL
         workspace.tally[1:] = KJ_PER_MOL * numbers.ravel()
-        workspace.fresh[0] = 1
-        self.calls, self.seconds = self.calls + 1, self.seconds + clock.perf_counter() - began
 
     def _of_sites(self, position: np.ndarray, state: State) -> tuple:
         energy, force, virial, _ = self._parts(self._called("on_sites", position, state), 3)
@@ -153,11 +175,12 @@ class BoundForce:
             row = int(np.argmin(np.isfinite(array).all(axis=1)))
             k = row if molecule is None else int(molecule[row])
             which = f"molecule {k + 1} ({self.system.species[self.system.model.species[k]].name})"
-            raise self._error(f"{array[row]} as {what} on {which}, which are not finite numbers")
+            values = f"{array[row]} as {what} on {which}, which are not finite numbers"
+            raise self._error(values, NotFiniteError)
         target[:] = unit * array
 
-    def _error(self, what: str) -> UserForceError:
-        return UserForceError(f"the force {self.name} returned {what}")
+    def _error(self, what: str, kind: type[UserForceError] = UserForceError) -> UserForceError:
+        return kind(f"the force {self.name} returned {what}")
 
     def _called(self, what: str, *arguments: Any) -> Any:
         try:

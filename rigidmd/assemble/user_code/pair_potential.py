@@ -10,45 +10,30 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from rigidmd.core.files import unreadable_reason
+from rigidmd.assemble.user_code.cutoffs import (
+    LARGEST_AT_CUTOFF, PairPotentialError, ValuesAtCutoff, check_cutoff, energy_scale, minimum_beyond,
+)  # fmt: skip
+from rigidmd.assemble.user_code.tables import Columns, read_columns
 from rigidmd.engines.system import System
 from rigidmd.forces.neighbors.pair_loop import PairForces, pair_forces
 from rigidmd.forces.neighbors.sites import exclusion_groups, sites_of
 from rigidmd.forces.parts import Tail, gather_per_molecule, inner_pairs, sites_named, sum_of_tails
 from rigidmd.forces.potentials.custom import CustomPotential, tail_of_pair
 from rigidmd.forces.potentials.formulas import (
-    DISTANCE, LARGEST_VALUE, LEAST_ROWS, Formula, FormulaError, formula_of_function, formula_of_table,
+    DISTANCE, Formula, FormulaError, formula_of_function, formula_of_table,
 )  # fmt: skip
 from rigidmd.forces.potentials.truncation import (
-    MINIMUM_TOLERANCE, TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
+    TRUNCATIONS, TruncationName, default_switch_start, short_cutoff_note, truncation_of,
     truncation_terms,
 )  # fmt: skip
 from rigidmd.scene.models import Molecule
 from rigidmd.scene.validation import did_you_mean, not_none
-from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 Rule = Literal["geometric", "arithmetic", "harmonic"]
 RULES: tuple[str, ...] = get_args(Rule)
 Parameters = Mapping[str, float]
-#: Largest energy at the cutoff without a warning, in kT, see `_ValuesAtCutoff.lost`. Lennard-Jones forces with usual
-#: cutoffs have 0.02 to 0.05.
-LARGEST_AT_CUTOFF = 0.2
 #: Largest error of the spline of a table without a warning, relative to its deepest energy.
 SPLINE_ERROR = 0.01
-#: A minimum is searched up to this multiple of the cutoff.
-REACH = 20.0
-#: Columns of the file of a tabulated potential, of which the last may be missing; the names have the units.
-COLUMNS = ("r_A", "energy_kJ_mol", "force_kJ_mol_A")
-LARGEST_TABLE = 20_000_000  # bytes
-
-
-class Columns(NamedTuple):
-    """A tabulated potential."""
-
-    r: Sequence[float]  # Å
-    energy: Sequence[float]  # kJ/mol
-    force: Sequence[float] | None = None  # -dE/dr, kJ/mol/Å
-    name: str = "a table"  # for messages
 
 
 class BoundPotential(NamedTuple):
@@ -59,14 +44,6 @@ class BoundPotential(NamedTuple):
     tail: Tail | None  # where the scene has forces.tail_correction
     notes: list[str]
     warnings: list[str]
-
-
-class PairPotentialError(ValueError):
-    """Errors of a pair potential in a scene."""
-
-    def __init__(self, *errors: str):
-        self.errors = list(errors)
-        super().__init__("; ".join(errors))
 
 
 @dataclass(frozen=True)
@@ -149,9 +126,9 @@ class PairLaw:
                 faults.append(f"between {types.example(i)} and {types.example(j)}: {error}")
             else:
                 between = f"{types.example(i)} and {types.example(j)}"
-                if minimum := _minimum_beyond(cutoff, radial):
+                if minimum := minimum_beyond(cutoff, radial):
                     short.append((minimum, between))
-                end = _ValuesAtCutoff.of(radial, cutoff, ends_there=bool(formula.shared))
+                end = ValuesAtCutoff.of(radial, cutoff, ends_there=bool(formula.shared))
                 if end.lost(name) > LARGEST_AT_CUTOFF * thermal:
                     unfinished.append((end.lost(name), end.describe(between, name, thermal, scale)))
             numbers[:, j, i], ends[:, j, i] = numbers[:, i, j], ends[:, i, j]
@@ -173,77 +150,6 @@ class PairLaw:
             advice = "use smaller intervals"
             warnings.append(f"the error of its spline is {formula.error:.1e} of its deepest energy: {advice}")
         return BoundPotential(term, formula, sum_of_tails(tails), notes, warnings)
-
-
-class _ValuesAtCutoff(NamedTuple):
-    """A pair potential where it is cut off, u Å²/ps²."""
-
-    cutoff: float  # Å
-    energy: float
-    force: float
-    change: float  # largest change of the energy up to twice the cutoff; 0 if the potential ends at its cutoff
-
-    @classmethod
-    def of(cls, radial: Callable[[float], tuple], cutoff: float, ends_there: bool) -> "_ValuesAtCutoff":
-        """ends_there : whether the potential is not known beyond the cutoff"""
-        if cutoff == inf:
-            return cls(cutoff, 0.0, 0.0, 0.0)
-        energy, force, _ = radial(cutoff)
-        beyond = [] if ends_there else [abs(radial(x * cutoff)[0] - energy) for x in (1.25, 1.5, 2.0)]
-        return cls(cutoff, energy, force, max([x for x in beyond if isfinite(x)], default=0.0))
-
-    def lost(self, truncation: TruncationName) -> float:
-        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and the work of the force
-        over a tenth of the cutoff, whichever is largest."""
-        jump = abs(self.energy) if truncation == "plain" else 0.0
-        return max(jump, self.change, 0.1 * self.cutoff * abs(self.force))
-
-    def describe(self, between: str, truncation: TruncationName, thermal: float, scale: str) -> str:
-        """A sentence. scale : what `thermal` is, such as kT at 298 K"""
-        energy, force = (f"{value / KJ_PER_MOL:.3g}" for value in (self.energy, self.force))
-        text = (
-            f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of {self.cutoff:g} Å "
-            f"with truncation = {truncation}, between {between}, and its force is {force} kJ/mol/Å; beyond "
-            "it does not act"
-        )
-        if self.change > abs(self.energy):
-            text += f", where it would change by {self.change / thermal:.2g} {scale}"
-        return f"{text}. Use a longer cutoff, or an energy that vanishes there"
-
-
-def energy_scale(system: System) -> tuple[float, str]:
-    """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its name; 0 without."""
-    scene = system.scene
-    temperatures = [x for stage in scene.stages for x in stage.temperatures if x > 0]
-    temperature = min(temperatures, default=scene.start.temperature_K or 0.0)
-    if temperature:
-        return BOLTZMANN * temperature, f"kT at {temperature:g} K"
-    return max((float(m.epsilon.max()) for m in system.species), default=0.0) or inf, "of the deepest well"
-
-
-def _minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
-    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which sites only repel."""
-    if cutoff == inf:
-        return None
-
-    def attracts(r: float) -> bool:
-        try:
-            return radial(r)[1] < 0
-        except (FormulaError, ArithmeticError, ValueError):
-            return False
-
-    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - MINIMUM_TOLERANCE, 32)):
-        return None
-    return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
-
-
-def check_cutoff(cutoff: float, system: System) -> None:
-    """Raise PairPotentialError unless the box is large enough for a cutoff (Å)."""
-    half = min(system.space.edges) / 2
-    if cutoff == inf and system.space.volume < inf:
-        raise PairPotentialError("it has no cutoff, and the box is periodic: set cutoff_A")
-    if not cutoff <= half:
-        raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
 
 
 class _SiteTypes:
@@ -416,56 +322,6 @@ def pair_law(
         energy, columns, constants, of_sites, tuple(sites), of_pairs, dict(mixing or {}), truncation, cutoff_A,
         switch_start_A, name or ("pair_law" if usual == "<lambda>" else usual), formula,
     )  # fmt: skip
-
-
-def read_columns(path: Path) -> Columns:
-    """The table of a file: numbers separated by commas or white space, comments after #, and perhaps a line with the
-    names of `COLUMNS` first. Raises PairPotentialError with all errors."""
-    try:
-        reason = unreadable_reason(path, LARGEST_TABLE)
-        text = "" if reason else path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = f"cannot be read as text: {error}"
-    if reason:
-        raise PairPotentialError(f"{path}: {reason}")
-    names, rows, faults = COLUMNS, [], []
-    lines = [(k, line.partition("#")[0].replace(",", " ").split()) for k, line in enumerate(text.splitlines(), 1)]
-    lines = [(k, words) for k, words in lines if words]
-    if lines and not _is_number(lines[0][1][0]):
-        (number, names), lines = lines[0], lines[1:]
-        if not {*COLUMNS[:2]} <= {*names} <= {*COLUMNS} or len({*names}) < len(names):
-            known = "r_A (Å), energy_kJ_mol (kJ/mol) and, if you like, force_kJ_mol_A (-dE/dr, kJ/mol/Å)"
-            raise PairPotentialError(f"{path}: line {number}: the columns are {', '.join(names)}; they must be {known}")
-    for number, words in lines:
-        values = [float(word) if _is_number(word) else inf for word in words]
-        row, expected = dict(zip(names, values, strict=False)), (len(names),) if names is not COLUMNS else (2, 3)
-        if len(words) not in ((len(rows[0]),) if rows else expected):
-            must = f"must have the same columns in all lines: {', '.join(names)}"
-            faults.append(f"line {number}: has {len(words)} numbers, {must}")
-        elif not all(map(isfinite, values)):
-            faults.append(f"line {number}: {' '.join(words):.60} has something else than finite numbers")
-        elif max(map(abs, values)) > LARGEST_VALUE:
-            largest = f"a number above {LARGEST_VALUE:g}, the largest of a table"
-            faults.append(f"line {number}: {' '.join(words):.60} has {largest}: begin it at larger distances")
-        elif not row["r_A"] > (rows[-1]["r_A"] if rows else 0.0):
-            least = f"{rows[-1]['r_A']:g} Å of the row before; sort the rows by distance" if rows else "0"
-            faults.append(f"line {number}: r_A = {row['r_A']:g} must be above {least}")
-        else:
-            rows.append(row)
-    if not faults and len(rows) < LEAST_ROWS:
-        faults.append(f"has {len(rows)} rows, needs {LEAST_ROWS} or more: one line for each distance")
-    if faults:
-        raise PairPotentialError(*(f"{path}: {fault}" for fault in faults))
-    r, energy, *force = ([row[name] for row in rows] for name in COLUMNS if name in rows[0])
-    return Columns(r, energy, force[0] if force else None, path.name)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _mapping(where: str, given: Any) -> Mapping[str, Any]:

@@ -6,8 +6,9 @@ from types import ModuleType
 
 from rigidmd.core.files import unreadable_reason
 from rigidmd.core.user_modules import USER_FILE_PREFIX, digest_of, module_of
-from rigidmd.errors import SceneError, describe_error
+from rigidmd.errors import SceneError, describe_error, option
 from rigidmd.scene import Scene
+from rigidmd.scene.validation import in_python
 
 #: Digests of the files that may run.
 _TRUSTED: set[str] = set()
@@ -16,7 +17,7 @@ _TRUSTED: set[str] = set()
 def trust(path: str | Path) -> None:
     """Allow scenes to run a Python file with these contents, at any path. Raises SceneError. The code can do anything
     that you can do: read it before. On the command line, --trust FILE does the same."""
-    _TRUSTED.add(digest_of(_source(Path(path), "--trust")))
+    _TRUSTED.add(digest_of(_source(Path(path), option("trust"))))
 
 
 def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
@@ -24,18 +25,21 @@ def check_trusted(scene: Scene, paths: Iterable[str | Path]) -> None:
     named = [path for key, path in scene.inputs.items() if key.endswith(".module")]
     contents = [_source(path, "forces.custom") for path in named]
     for path in paths:
-        if _source(Path(path), "--trust") not in contents:
+        if _source(Path(path), option("trust")) not in contents:
             files = f"it names {', '.join(map(str, named))}" if named else "it names none"
             what = f"is not a file that [[forces.custom]] of {scene.source} names by module"
-            raise SceneError("--trust", [f"{path} {what}: {files}"])
+            raise SceneError(option("trust"), [f"{path} {what}: {files}"])
 
 
 def trusted_module(path: Path, key: str) -> ModuleType:
     """The module of a file that a scene names by `key`, if it is trusted. Raises SceneError."""
     source = _source(path, key)
     if digest_of(source) not in _TRUSTED:
-        why = "is Python code, which can do whatever you can: read it, and if you trust it, add"
-        raise SceneError(key, [f"{path} {why} --trust {path} (in Python: rigidmd.trust({str(path)!r}))"])
+        why = "is Python code, which can do whatever you can: read it, and if you trust it,"
+        advice = f"call rigidmd.trust({str(path)!r})"
+        if not in_python():
+            advice = f"add {option('trust')} {path} (in Python: {advice.removeprefix('call ')})"
+        raise SceneError(key, [f"{path} {why} {advice}"])
     try:
         return module_of(source, str(path), USER_FILE_PREFIX)
     except SceneError:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rigidmd.core.integrators import RADAU, SCHEMES, SOLVERS
-from rigidmd.errors import SceneError
+from rigidmd.errors import SceneError, option
 from rigidmd.figures.style import FAINT, INK, curve_style, label_minor_ticks, new_figure, open_axis, write_figure
 from rigidmd.io.write import Column, Table
 from rigidmd.run.force_errors import single_precision_errors
@@ -52,7 +52,7 @@ def measure_accuracy(
     if unknown := [name for name in integrators if name not in known]:
         of_all = f"(known: {', '.join(known)})"
         errors = [f"unknown integrator {name}{did_you_mean(name, known)} {of_all}" for name in unknown]
-        raise SceneError("--integrators", errors)
+        raise SceneError(option("integrators"), errors)
     lengths = [*(timesteps or []), *([] if span is None else [span])]
     if not all(0 < length < inf for length in lengths) or repeats < 1:
         raise SceneError("accuracy", ["time steps, span and repeats must be finite and greater than 0"])

@@ -13,9 +13,9 @@ from rigidmd.core.state import State
 from rigidmd.core.statistics import mean_and_error
 from rigidmd.dynamics.model import remove_momentum
 from rigidmd.engines.samples import COLUMNS, NOT_AVERAGED, Samples
-from rigidmd.errors import SceneError, SimulationError
+from rigidmd.errors import SceneError, SimulationError, option
 from rigidmd.run import Simulation
-from rigidmd.run.molecular import scale_to_mean_box
+from rigidmd.run.mean_box import scale_to_mean_box
 from rigidmd.run.observers import Every
 from rigidmd.run.pilot.stable_step import stiffest_mode
 from rigidmd.scene import BodyScene, MolecularScene
@@ -161,7 +161,7 @@ def measure_averages(
     The earlier stages of the scene run before, once.
     """
     if isinstance(scene, BodyScene):
-        raise SceneError(scene.source, ["--averages is for molecules; a single body has no thermostat"])
+        raise SceneError(scene.source, [f"{option('averages')} is for molecules; a single body has no thermostat"])
     check_engine_is_rigidmd(scene)
     stage = _with_thermostat(scene)
     schemes = scene.schemes | WITH_THERMOSTAT
@@ -170,9 +170,10 @@ def measure_averages(
         of_stage = [] if stage.is_auto else [(stage.integrator, stage.thermostat_kind)]
         pairs = list(dict.fromkeys([*of_stage, *pairs]))
     if not all(0 < length < inf for length in (sample, *(timesteps or []))):
-        raise SceneError("accuracy", ["time steps and --sample-ps must be finite and greater than 0"])
+        raise SceneError("accuracy", [f"time steps and {option('sample_ps')} must be finite and greater than 0"])
     if timesteps and max(timesteps) * FEMTOSECOND > sample:
-        raise SceneError("--timesteps", [f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"])
+        error = f"{max(timesteps):g} fs is longer than the {sample:g} ps sampled with it"
+        raise SceneError(option("timesteps"), [error])
     progress(0.0)
     simulation, state = start_of_last_stage(scene)
     remove_momentum(simulation.system.model, state.velocity)
@@ -239,10 +240,10 @@ def _with_thermostat(scene: MolecularScene) -> Stage:
     stage = scene.stages[-1]
     if not stage.has_thermostat:
         advice = "give it ensemble = 'nvt' or 'npt'"
-        error = f"--averages samples the last stage, and {stage.ensemble} has no thermostat: {advice}"
+        error = f"{option('averages')} samples the last stage, and {stage.ensemble} has no thermostat: {advice}"
         raise SceneError(scene.source, [error])
     if len(set(stage.temperatures)) > 1 or (stage.has_barostat and stage.pressures[0] != stage.pressures[1]):
-        error = "--averages needs one temperature and one pressure in the last stage; here they change"
+        error = f"{option('averages')} needs one temperature and one pressure in the last stage; here they change"
         raise SceneError(scene.source, [error])
     return stage
 
@@ -254,7 +255,7 @@ def _parse_method(text: str, stage: Stage, known: Iterable[str]) -> tuple[str, s
     for what, name, names in (("integrator", integrator, known), ("thermostat", thermostat, THERMOSTATS)):
         if name not in names:
             error = f"unknown {what} {name}{did_you_mean(name, names)} (known: {', '.join(names)})"
-            raise SceneError("--integrators", [error])
+            raise SceneError(option("integrators"), [error])
     return integrator, thermostat
 
 

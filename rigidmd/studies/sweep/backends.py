@@ -214,7 +214,7 @@ class Cluster(Backend):
         try:
             from distributed import Client, LocalCluster
         except ImportError:
-            raise SettingError("--scheduler needs dask.distributed: pip install distributed") from None
+            raise SettingError(f"{option('scheduler')} needs dask.distributed: pip install distributed") from None
         self._local_cluster = None
         try:
             if address == LOCAL:
@@ -224,8 +224,8 @@ class Cluster(Backend):
             client: Any = Client(self._local_cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise SettingError(
-                f"--scheduler {address}: no scheduler of dask.distributed answers ({error}); start one with `dask "
-                "scheduler` and workers with `dask worker`"
+                f"{option('scheduler')} {address}: no scheduler of dask.distributed answers ({error}); "
+                "start one with `dask scheduler` and workers with `dask worker`"
             ) from None
         # two points per thread of its workers, so that none is ever idle
         capacity, topic = lambda: max(1, 2 * sum(client.nthreads().values())), f"rigidmd-{client.id}"

@@ -22,6 +22,7 @@ from rigidmd.errors import InputError, OutputError, RigidMDError, SceneError, op
 from rigidmd.io.folder import elsewhere
 from rigidmd.run.resume import NOT_COMPARED, differences, file_digest, input_digests, keys_of, plain, scene_digest
 from rigidmd.scene import BodyScene, MolecularScene, Scene, parse_override
+from rigidmd.scene.validation import in_python, setting
 from rigidmd.studies.sweep.folder import (
     SEED, Manifest, SweepPoint, clear_sweep, describe_values, is_sweep, point_name, read_manifest, short_keys,
     state_on_disk, value_name,
@@ -118,15 +119,17 @@ def _check_axes(axes: Sequence[Axis]) -> None:
         errors += [f"{axis.keys[0]}: {name} is listed {times} times" for name, times in names.items() if times > 1]
     swept = [axis for axis in axes if axis.swept]
     if not swept:
-        errors.append(
-            "no key has several values: give it a list or a range, such as --set stages.0.temperature_K=280,290 or "
-            "--set seed=1..8"
-        )
+        lists = "280,290", "1..8"
+        if in_python():
+            lists = "[280, 290]", "range(1, 9)"
+        keys = "stages.0.temperature_K", SEED
+        example = " or ".join(setting(*pair, argument="sets") for pair in zip(keys, lists, strict=True))
+        errors.append(f"no key has several values: give it a list or a range, such as {example}")
     count = prod(len(axis.values) for axis in swept)
     if count > MOST_POINTS:
         errors.append(f"these are {count} points; a sweep has {MOST_POINTS} at most")
     if errors:
-        raise SceneError(OPTION, errors)
+        raise SceneError(option("sets"), errors)
 
 
 def axes_of(sets: Mapping[str, Any]) -> list[Axis]:
@@ -150,7 +153,7 @@ def with_seeds(scene: Path, axes: list[Axis], replicas: int, data: Mapping[str, 
         raise SceneError(option("replicas"), [f"{scene} is a single body, whose motion has no seed"])
     with_seed = [axis for axis in axes if SEED in axis.keys]
     if any(axis.swept or len(axis.keys) > 1 for axis in with_seed):
-        raise SceneError(option("replicas"), ["sets seeds, and --set sets them too; leave out one of them"])
+        raise SceneError(option("replicas"), [f"sets seeds, and {option('sets')} sets them too; leave out one of them"])
     seed = with_seed[0].values[0] if with_seed else data.get(SEED, MolecularScene.model_fields[SEED].default)
     if not isinstance(seed, int):
         raise SceneError(str(scene), [f"seed is {shorten_repr(seed)}, must be an integer"])

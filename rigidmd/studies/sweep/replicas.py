@@ -26,7 +26,7 @@ from rigidmd.studies.sweep.folder import (
     state_on_disk,
 )
 from rigidmd.studies.sweep.table import SweepRow, key_columns, write_analyses_figure
-from rigidmd.studies.sweep.windows import is_of_windows, mean_force_of_sweep
+from rigidmd.studies.sweep.windows import is_of_windows, write_mean_force
 
 ANALYSES = "analysis.csv"
 
@@ -94,7 +94,7 @@ WINDOWS = "all windows"
 def _mean_force(folder: Path, manifest: Manifest, ready: set[str], figures: str) -> Combination:
     """The potential of mean force of all windows, as the combination of all points."""
     points = [point for point in manifest.points if point.folder in ready]
-    result, files = mean_force_of_sweep(folder, manifest, points, figures)
+    result, files = write_mean_force(folder, manifest, points, figures)
     return Combination(WINDOWS, {}, len(points), [result], {}, files)
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from rigidmd.assemble.user_code.trust import trust as trust_file
 from rigidmd.core.files import write_text, writing
 from rigidmd.core.plain_text import UNSAFE, as_word, in_comment
-from rigidmd.errors import OutputError, SceneError, SimulationError
+from rigidmd.errors import OutputError, SceneError, SimulationError, option
 from rigidmd.io.folder import FolderLock, add_to_folder, elsewhere, is_empty
 from rigidmd.io.progress import Bar, progress_of
 from rigidmd.run.resume import NOT_COMPARED, keys_of, plain
@@ -88,7 +88,7 @@ def open_sweep(
     axes = axes if replicas is None else with_seeds(scene, axes, replicas, data)
     keys = [key for axis in axes for key in axis.keys]
     if trust and not any("module" in str(part) for part in (data.get("forces"), keys)):
-        raise SceneError("--trust", [f"{scene} names no Python file by module in [[forces.custom]]"])
+        raise SceneError(option("trust"), [f"{scene} names no Python file by module in [[forces.custom]]"])
     named = next((axis.values[0] for axis in axes if "name" in axis.keys), None) or data.get("name")
     folder = folder or Path("runs") / f"{named or default_name(scene)}-sweep"
     if folder.exists() and not folder.is_dir():

@@ -11,6 +11,7 @@ import numpy as np
 
 from rigidmd.analysis.files import read_table
 from rigidmd.analysis.rigid_frames import earlier_production, production_samples
+from rigidmd.core.display import Displayed
 from rigidmd.core.statistics import format_with_error, mean_and_error, standard_error
 from rigidmd.engines.samples import BODY_COLUMNS, IN_LOGS, NOT_AVERAGED
 from rigidmd.errors import RigidMDError
@@ -59,7 +60,7 @@ class SweepRow:
 
 
 @dataclass
-class Table:
+class Table(Displayed):
     """Results of a sweep: a row for each combination of values, columns of means and errors.
 
     table["Temperature (K)"] is a column of means as an array (rows,), table.error("Temperature (K)") of their errors,
@@ -214,6 +215,12 @@ def collect(folder: Path, manifest: Manifest) -> tuple[Table, list[Path]]:
 
 
 def table_text(table: Table) -> str:
+    return main_columns(table).text(left=())
+
+
+def main_columns(table: Table) -> ReportTable:
+    """The table that is printed and displayed: keys, number of runs, and the main columns with their errors."""
+
     def text(value: float, error: float | None) -> str:
         return format_with_error(value, error) if np.isfinite(value) else "-"
 
@@ -221,7 +228,7 @@ def table_text(table: Table) -> str:
     shown = [name for name in (*MAIN, *MAIN_OF_BODY) if name in table.columns] + _earlier_densities(table)
     keys = [Column(short[key], lambda row, key=key: value_name(row.values[key])) for key in table.keys]
     means = [Column(SHORT.get(name, name), lambda row, name=name: text(*row[name])) for name in shown]
-    return ReportTable([*keys, Column("runs", lambda row: str(len(row.runs))), *means], table.rows).text(left=())
+    return ReportTable([*keys, Column("runs", lambda row: str(len(row.runs))), *means], table.rows)
 
 
 DENSITY, PRESSURE = "Density (g/mL)", "Pressure (bar)"

@@ -13,7 +13,8 @@ from rigidmd.errors import OutputError
 from rigidmd.run.record import read_record
 from rigidmd.scene import MolecularScene
 from rigidmd.scene.validation import not_none
-from rigidmd.studies.sweep.folder import SEED, Manifest, SweepPoint
+from rigidmd.studies.sweep.folder import SEED, Manifest, SweepPoint, read_manifest, state_on_disk
+from rigidmd.studies.sweep.table import Table
 from rigidmd.units import BOLTZMANN, KJ_PER_MOL
 
 KEY = re.compile(r"fields\.restraints\.(\d+)\.(distance_A|stiffness_kJ_mol_A2)")
@@ -24,14 +25,38 @@ def is_of_windows(manifest: Manifest) -> bool:
     return any((found := KEY.fullmatch(key)) and found[2] == "distance_A" for key in manifest.keys)
 
 
-def mean_force_of_sweep(
+def pmf(sweep: Table | str | Path) -> AnalysisResult:
+    """The potential of mean force along the restrained distance of a sweep, by all its windows.
+
+    sweep : what `rigidmd.sweep` or `rigidmd.read_run` returned, or the folder of a sweep
+
+    Points that have not finished are left out. Nothing is written. Raises OutputError.
+    """
+    folder = sweep.folder if isinstance(sweep, Table) else Path(sweep)
+    manifest = read_manifest(folder)
+    finished = [point for point in manifest.points if state_on_disk(folder, point) == "finished"]
+    if not finished:
+        raise OutputError(f"{folder}: no point of the sweep has finished")
+    result, _ = mean_force_of_points(folder, manifest, finished)
+    return result
+
+
+def write_mean_force(
     folder: Path, manifest: Manifest, points: list[SweepPoint], figures: str
 ) -> tuple[AnalysisResult, list[Path]]:
-    """The potential of mean force of the points that have finished, and its files. Raises OutputError."""
+    """`mean_force_of_points`, and the files that it is written to. Raises OutputError."""
+    result, used = mean_force_of_points(folder, manifest, points)
+    return result, write_results(folder, used, [result], {}, figures)
+
+
+def mean_force_of_points(
+    folder: Path, manifest: Manifest, points: list[SweepPoint]
+) -> tuple[AnalysisResult, dict[str, Any]]:
+    """The potential of mean force of finished points, and the samples used. Raises OutputError."""
     of = [(key, KEY.fullmatch(key)) for key in manifest.keys]
     if not is_of_windows(manifest):
-        why = "--set fields.restraints.0.distance_A=3.5,4,4.5,..."
-        raise OutputError(f"{folder}: pmf needs a sweep over the distance of a restraint: {why}")
+        key = "fields.restraints.0.distance_A"
+        raise OutputError(f"{folder}: pmf needs a sweep over the distance of a restraint, such as {key}")
     if other := [key for key, found in of if found is None and key != SEED]:
         raise OutputError(f"{folder}: pmf needs windows that differ by their restraint alone, not by {other[0]}")
     numbers = {int(found[1]) for _, found in of if found is not None}
@@ -46,8 +71,7 @@ def mean_force_of_sweep(
         used = _together(used, times)
     if len(temperatures) > 1:
         raise OutputError(f"{folder}: the windows have different temperatures")
-    result = potential_of_mean_force(windows, BOLTZMANN * temperatures.pop() / KJ_PER_MOL)
-    return result, write_results(folder, used, [result], {}, figures)
+    return potential_of_mean_force(windows, BOLTZMANN * temperatures.pop() / KJ_PER_MOL), used
 
 
 def _window(folder: Path, k: int) -> tuple[Window, float, dict[str, Any]]:

@@ -1,0 +1,97 @@
+"""Checks of users' pair potentials at their cutoff."""
+
+from collections.abc import Callable
+from math import inf, isfinite
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidmd.engines.system import System
+from rigidmd.forces.potentials.formulas import FormulaError
+from rigidmd.forces.potentials.truncation import MINIMUM_TOLERANCE, TruncationName
+from rigidmd.units import BOLTZMANN, KJ_PER_MOL
+
+#: Largest energy at the cutoff without a warning, in kT, see `ValuesAtCutoff.lost`. Lennard-Jones
+#: forces with usual cutoffs have 0.02 to 0.05.
+LARGEST_AT_CUTOFF = 0.2
+#: A minimum is searched up to this multiple of the cutoff.
+REACH = 20.0
+
+
+class PairPotentialError(ValueError):
+    """Errors of a pair potential in a scene."""
+
+    def __init__(self, *errors: str):
+        self.errors = list(errors)
+        super().__init__("; ".join(errors))
+
+
+class ValuesAtCutoff(NamedTuple):
+    """A pair potential where it is cut off, u Å²/ps²."""
+
+    cutoff: float  # Å
+    energy: float
+    force: float
+    change: float  # largest change of the energy up to twice the cutoff; 0 if the potential ends at its cutoff
+
+    @classmethod
+    def of(cls, radial: Callable[[float], tuple], cutoff: float, ends_there: bool) -> "ValuesAtCutoff":
+        """ends_there : whether the potential is not known beyond the cutoff"""
+        if cutoff == inf:
+            return cls(cutoff, 0.0, 0.0, 0.0)
+        energy, force, _ = radial(cutoff)
+        beyond = [] if ends_there else [abs(radial(x * cutoff)[0] - energy) for x in (1.25, 1.5, 2.0)]
+        return cls(cutoff, energy, force, max([x for x in beyond if isfinite(x)], default=0.0))
+
+    def lost(self, truncation: TruncationName) -> float:
+        """What the truncation changes: the jump of the energy, its change beyond the cutoff, and the work of the force
+        over a tenth of the cutoff, whichever is largest."""
+        jump = abs(self.energy) if truncation == "plain" else 0.0
+        return max(jump, self.change, 0.1 * self.cutoff * abs(self.force))
+
+    def describe(self, between: str, truncation: TruncationName, thermal: float, scale: str) -> str:
+        """A sentence. scale : what `thermal` is, such as kT at 298 K"""
+        energy, force = (f"{value / KJ_PER_MOL:.3g}" for value in (self.energy, self.force))
+        text = (
+            f"is {energy} kJ/mol ({self.energy / thermal:.2g} {scale}) at its cutoff of {self.cutoff:g} Å "
+            f"with truncation = {truncation}, between {between}, and its force is {force} kJ/mol/Å; beyond "
+            "it does not act"
+        )
+        if self.change > abs(self.energy):
+            text += f", where it would change by {self.change / thermal:.2g} {scale}"
+        return f"{text}. Use a longer cutoff, or an energy that vanishes there"
+
+
+def energy_scale(system: System) -> tuple[float, str]:
+    """The smallest kT of a scene, or else its deepest well between two sites (u Å²/ps²), and its name; 0 without."""
+    scene = system.scene
+    temperatures = [x for stage in scene.stages for x in stage.temperatures if x > 0]
+    temperature = min(temperatures, default=scene.start.temperature_K or 0.0)
+    if temperature:
+        return BOLTZMANN * temperature, f"kT at {temperature:g} K"
+    return max((float(m.epsilon.max()) for m in system.species), default=0.0) or inf, "of the deepest well"
+
+
+def minimum_beyond(cutoff: float, radial: Callable[[float], tuple]) -> float | None:
+    """The distance (Å) of the minimum of an energy, if it lies beyond the cutoff, within which sites only repel."""
+    if cutoff == inf:
+        return None
+
+    def attracts(r: float) -> bool:
+        try:
+            return radial(r)[1] < 0
+        except (FormulaError, ArithmeticError, ValueError):
+            return False
+
+    if any(attracts(cutoff * x) for x in np.linspace(0.5, 1 - MINIMUM_TOLERANCE, 32)):
+        return None
+    return next((cutoff * x for x in np.geomspace(1, REACH, 400)[1:] if attracts(cutoff * x)), None)
+
+
+def check_cutoff(cutoff: float, system: System) -> None:
+    """Raise PairPotentialError unless the box is large enough for a cutoff (Å)."""
+    half = min(system.space.edges) / 2
+    if cutoff == inf and system.space.volume < inf:
+        raise PairPotentialError("it has no cutoff, and the box is periodic: set cutoff_A")
+    if not cutoff <= half:
+        raise PairPotentialError(f"its cutoff of {cutoff:g} Å is longer than half an edge of the box, {half:.3f} Å")
