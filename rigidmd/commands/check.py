@@ -1,10 +1,17 @@
 """`rigidmd check`."""
 
-from rigidmd.commands.arguments import SCENE, Options, add_engine, command, read_scene
+from typing import Any
+
+from rigidmd.commands.arguments import SCENE, Options, add_engine, argument, command, read_scene
 from rigidmd.commands.streams import warn
+from rigidmd.errors import SceneError
 
 
-@command(70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine)
+@command(
+    70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine,
+    argument("--program", action="store_true",
+        help="also print the rows of a step: what is done, in which order, on how many blocks"),
+)  # fmt: skip
 def _check(options: Options) -> int:
     from rigidmd.assemble.describe import describe_system
     from rigidmd.scene import BodyScene
@@ -14,6 +21,8 @@ def _check(options: Options) -> int:
         from rigidmd.assemble.body import build_body
         from rigidmd.run.pilot.stable_step import body_step_warnings
 
+        if options.program:
+            raise SceneError(scene.source, ["--program is for molecules; the step of a body is one loop"])
         body = build_body(scene)
         print(describe_system(body))
         warnings = [*body.warnings, *body_step_warnings(body)]
@@ -26,7 +35,23 @@ def _check(options: Options) -> int:
         print(describe_system(system))
         if scene.engine.is_external:
             print(check_engine(system))
+        if options.program:
+            _print_programs(system)
         warnings = [*system.warnings, *step_warnings(scene)]
     for warning in warnings:
         warn(warning)
     return 0
+
+
+def _print_programs(system: Any) -> None:
+    """Print the program of each stage in which time passes."""
+    from rigidmd.assemble.build import integrator_of_stage
+    from rigidmd.engines.cpu.program import describe_program, program_of
+
+    engine = system.engine()
+    for k, stage in enumerate(system.scene.stages):
+        if stage.is_minimisation or stage.is_auto:
+            continue
+        scheme = integrator_of_stage(system, k)
+        print(f"\nprogram of a step of stages.{k} ({stage.label}, {scheme.name}):")
+        print(describe_program(program_of(engine, system.state, scheme)))

@@ -23,6 +23,7 @@ ALWAYS = -1
 class Pass(NamedTuple):
     """A row of a program."""
 
+    text: str  # what it does, for `rigidmd check --program`
     task: CompiledTask
     content: tuple  # its arguments
     blocks: int = 1

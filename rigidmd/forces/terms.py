@@ -134,8 +134,8 @@ def passes_of(workspace: NamedTuple, into: Evaluation) -> list[Pass]:
         return workspace.passes(into)
     state, load, tally, status = into
     return [
-        Pass(_add_plain, (workspace, state, load, status), when=FORCES_ONLY),
-        Pass(_add_tallied, (workspace, state, load, tally, status), when=TALLIED),
+        Pass("add forces", _add_plain, (workspace, state, load, status), when=FORCES_ONLY),
+        Pass("add forces and energies", _add_tallied, (workspace, state, load, tally, status), when=TALLIED),
     ]
 
 
@@ -194,7 +194,7 @@ class TermDispatcher:
 
     def _rate_passes(self, workspaces: tuple[NamedTuple, ...], state: State) -> list[Pass]:
         dependent = [w for w in workspaces if getattr(type(w), "time_dependent", False)]
-        return [Pass(_add_rate, (w, state, self._power)) for w in dependent if self._with_rates]
+        return [Pass("rate of the energy", _add_rate, (w, state, self._power)) for w in dependent if self._with_rates]
 
     def bind(
         self, workspaces: tuple[NamedTuple, ...], state: State, load: Load, other: Load | None = None

@@ -10,12 +10,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import compile_together, set_threads
+from rigidmd.compile import Pass, compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
-    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, Load, State, no_load,
+    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State, no_load,
 )  # fmt: skip
 from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
@@ -32,11 +32,13 @@ from rigidmd.forces.terms import (
     FORCES_ONLY,
     TALLIED,
     WITH_ENERGIES,
+    Evaluation,
     NoForce,
     Setup,
     TermDispatcher,
     checkpoint_arrays,
     compute_load_with_energies,
+    passes_of,
     restored,
     with_capacity,
     with_code,
@@ -94,7 +96,6 @@ class CpuEngine(Engine):
         self._box_workspace: BarostatWorkspace | None = None
         self._trajectory: TrajectoryWorkspace | None = None
         self._stale = True
-        self._first = True
         self._checked: State | None = None
         self._moved: State | None = None
         self._observed_load: Load | None = None  # returned by the last `evaluate_current`
@@ -134,6 +135,9 @@ class CpuEngine(Engine):
 
     def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
+        if "steps" not in self._dispatchers:
+            model, thermostat = self.model_for(integrator), integrator.thermostat or NoThermostat()
+            self._compile(lambda: (self._new_dispatcher("steps", workspaces), molecule_code(model, thermostat)))
         dispatcher = self._dispatcher("steps", workspaces)
         bound_to = (self.model, integrator, state, load, dispatcher)
         if self._advance is None or any(now is not then for now, then in zip(bound_to, self._advance[0], strict=True)):
@@ -176,8 +180,11 @@ class CpuEngine(Engine):
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
-            self._dispatchers[use] = TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
+            self._dispatchers[use] = self._new_dispatcher(use, workspaces)
         return self._dispatchers[use]
+
+    def _new_dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
+        return TermDispatcher(workspaces, USES[use], with_rates=use == "steps")
 
     def model_for(self, scheme: Scheme) -> Model | Body:
         """The model with the rotor of a scheme. The exact rotor differs only for asymmetric bodies."""
@@ -298,6 +305,13 @@ class CpuEngine(Engine):
     def trajectories(self) -> np.ndarray | None:
         return None if self._trajectory is None else self._trajectory.sums.copy()
 
+    def passes(self, state: State) -> dict[str, list[Pass]]:
+        """Name of a term -> its passes at a state, in their order. Nothing is compiled."""
+        load, status = no_load(state), np.zeros(1, np.int64)
+        into = Evaluation(state, load, np.zeros(TALLY_SIZE), status)
+        workspaces = zip(self.names, self.new_workspaces(state), strict=False)
+        return {name: passes_of(workspace, into) for name, workspace in workspaces}
+
     def new_workspaces(self, state: State) -> tuple[NamedTuple, ...]:
         """New workspaces for the cell of a state, without machine code. Their arrays show the memory needed."""
         setup = self._setup._replace(cell=state.cell)
@@ -315,17 +329,14 @@ class CpuEngine(Engine):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
             spaces = self.new_workspaces(state)
-            if self._first and isinstance(self.model, Model):
-                compile_together(lambda: self._compile(spaces))
-            self._first = False
-            self._workspaces = tuple(with_code(workspace) for workspace in spaces)
+            self._compile(lambda: TermDispatcher(tuple(map(with_code, spaces)), USES["observations"]))
+            self._workspaces = tuple(map(with_code, spaces))
         return self._workspaces
 
-    def _compile(self, spaces: tuple[NamedTuple, ...]) -> None:
-        """Compile all code for molecules that does not depend on a thermostat or a barostat."""
-        workspaces = tuple(with_code(workspace) for workspace in spaces)
-        TermDispatcher(workspaces, USES["steps"], with_rates=True)
-        molecule_code(self.model, NoThermostat())
+    def _compile(self, make: Callable[[], object]) -> None:
+        """Compile all code that a function makes for molecules; a body has too little for a second process."""
+        if isinstance(self.model, Model):
+            compile_together(make)
 
     def _handle_status(self, status: int, state: State) -> tuple[NamedTuple, ...]:
         """Handle a status code of a kernel, and return the workspaces with which to call it again."""

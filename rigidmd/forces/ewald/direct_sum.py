@@ -156,10 +156,10 @@ class EwaldWorkspace(NamedTuple):
         blocks = len(sums.tallies)
         return [
             position_pass(self.sites, into.state, sums.position),
-            Pass(_follow_cell, (*content, into.state)),
-            Pass(_compute_phases, content, blocks),
-            Pass(_sum_structure_factors, content, blocks),
-            Pass(_compute_forces, content, blocks),
+            Pass("strengths of k-vectors, if the cell has changed", _follow_cell, (*content, into.state)),
+            Pass("phases of sites", _compute_phases, content, blocks),
+            Pass("structure factors", _sum_structure_factors, content, blocks),
+            Pass("forces on sites", _compute_forces, content, blocks),
             *load_passes(self.sites, into, sums.force, sums),
         ]
 

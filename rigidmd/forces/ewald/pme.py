@@ -147,14 +147,14 @@ class PmeWorkspace(NamedTuple):
         blocks = len(mesh.tallies)
         return [
             position_pass(self.sites, into.state, mesh.position),
-            Pass(_follow_cell, (self.code, *content, into.state)),
-            Pass(_scale_positions, content, blocks),
-            Pass(_sort_sites, (*content, into.status)),
-            Pass(_spread_charges, content, blocks),
-            Pass(_convolve, (self.smooth, mesh, None), blocks, FORCES_ONLY),
-            Pass(_convolve, (self.smooth, mesh, mesh.tallies), blocks, TALLIED),
-            Pass(_transform_back, content, blocks),
-            Pass(_interpolate_forces, content, blocks),
+            Pass("influence function, if the cell has changed", _follow_cell, (self.code, *content, into.state)),
+            Pass("positions in grid cells", _scale_positions, content, blocks),
+            Pass("sort sites by plane", _sort_sites, (*content, into.status)),
+            Pass("charges on the grid, transform of planes", _spread_charges, content, blocks),
+            Pass("transform across planes, times influence", _convolve, (self.smooth, mesh, None), blocks, FORCES_ONLY),
+            Pass("the same, with energy and virial", _convolve, (self.smooth, mesh, mesh.tallies), blocks, TALLIED),
+            Pass("transform of planes to the potential", _transform_back, content, blocks),
+            Pass("forces on sites", _interpolate_forces, content, blocks),
             *load_passes(self.sites, into, mesh.force, mesh),
         ]
 

@@ -100,20 +100,22 @@ class PairWorkspace(NamedTuple):
         """Update of the list; forces of rows, with what else is needed; their sums on sites and molecules."""
         pairs, sums, sites, tallies = self.pairs, self.sums, self.sites, self.sums.tallies
         blocks, content = len(tallies), (self.slot_potential, pairs, sums)
+        moved = (self.list_code, pairs, sites, into.state, into.status)
         numbers = (self.potential, self.slot_potential, pairs, sums, into.status)
         found = [
-            Pass(update_pair_list, (self.list_code, pairs, sites, into.state, into.status)),
-            Pass(_arrange_numbers, numbers),
-            Pass(_sum_forces, (*content, None, None), blocks, FORCES_ONLY),
+            Pass("update the neighbour list", update_pair_list, moved),
+            Pass("numbers of sites in its order, if it is new", _arrange_numbers, numbers),
+            Pass("forces of pairs", _sum_forces, (*content, None, None), blocks, FORCES_ONLY),
         ]
-        energies = (*content, tallies, tallies)
+        energies, virials = (*content, tallies, tallies), (*content, tallies, None)
+        when = WITH_ENERGIES if self.needs_virials else TALLIED
+        found.append(Pass("forces and energies of pairs", _sum_forces, energies, blocks, when))
         if self.needs_virials:
-            found.append(Pass(_sum_forces, energies, blocks, WITH_ENERGIES))
-            found.append(Pass(_sum_forces, (*content, tallies, None), blocks, WITH_VIRIALS))
-        else:
-            found.append(Pass(_sum_forces, energies, blocks, TALLIED))
-        found.append(Pass(_gather_forces, (pairs, sums, None), blocks, FORCES_ONLY))
-        found.append(Pass(_gather_forces, (pairs, sums, tallies), blocks, TALLIED))
+            found.append(Pass("forces and virials of pairs", _sum_forces, virials, blocks, WITH_VIRIALS))
+        found += [
+            Pass("sum forces on sites", _gather_forces, (pairs, sums, None), blocks, FORCES_ONLY),
+            Pass("sum forces on sites", _gather_forces, (pairs, sums, tallies), blocks, TALLIED),
+        ]
         return found + load_passes(sites, into, self.forces_in_slots, sums)
 
     def with_capacity(self, cell: np.ndarray) -> "PairWorkspace":

@@ -254,7 +254,9 @@ def _sum_offset_virial_of_block(arguments, block):
 
 def position_pass(sites: BodySites | CentralSites, state: State, position: np.ndarray) -> Pass:
     """`compute_site_positions` into an array (s, 3)."""
-    return Pass(_compute_positions_of_block, (sites, state, position), blocks_of(len(state.position)))
+    return Pass(
+        "positions of sites", _compute_positions_of_block, (sites, state, position), blocks_of(len(state.position))
+    )
 
 
 def load_passes(
@@ -267,13 +269,16 @@ def load_passes(
     state, load, tally = into.state, into.load, into.tally
     blocks = blocks_of(len(state.position))
     found = [
-        Pass(_load_block, (sites, state, load, force), blocks),
-        Pass(_sum_tallies, (sums.tallies, tally), when=TALLIED),
+        Pass("forces and torques on molecules", _load_block, (sites, state, load, force), blocks),
+        Pass("sum energies and virials", _sum_tallies, (sums.tallies, tally), when=TALLIED),
     ]
     if isinstance(sites, BodySites):
         offsets = (sites, state, force, sums.virial)
-        found.append(Pass(_sum_offset_virial_of_block, offsets, blocks, TALLIED))
-        found.append(Pass(_subtract_offset_virial, (sums.virial[:blocks], tally), when=TALLIED))
+        virial = (sums.virial[:blocks], tally)
+        found += [
+            Pass("virial within molecules", _sum_offset_virial_of_block, offsets, blocks, TALLIED),
+            Pass("subtract it", _subtract_offset_virial, virial, when=TALLIED),
+        ]
     return found
 
 
