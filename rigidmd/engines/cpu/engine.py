@@ -15,7 +15,8 @@ from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
 from rigidmd.core.state import (
-    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State, no_load,
+    BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State,
+    no_load,
 )  # fmt: skip
 from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body
