@@ -26,7 +26,7 @@ from rigidmd.core.state import state_of
 from rigidmd.dynamics.barostats import BAROSTATS, Confinement, Pressure
 from rigidmd.dynamics.model import Model, conserved_momentum, count_degrees_of_freedom, mobile
 from rigidmd.dynamics.noise import BAROSTAT, THERMOSTAT, key_of
-from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp, VelocityRescaling, constant_ramp
+from rigidmd.dynamics.thermostats import THERMOSTATS, Ramp
 from rigidmd.engines.system import System
 from rigidmd.errors import SceneError, StructureError
 from rigidmd.forces.neighbors.space import Orthorhombic, Space, cell_of, space_of
@@ -216,15 +216,12 @@ def left_out(
 
 def integrator_of_stage(system: System, k: int) -> Scheme:
     """The scheme of stage k, with its thermostat, its barostat and the removal of total momentum."""
-    scene, stage = system.scene, system.scene.stages[k]
-    found, thermostat, kinds = stage.scheme, system.thermostat, {other.thermostat_kind for other in scene.stages}
+    stage = system.scene.stages[k]
+    found, thermostat = stage.scheme, system.thermostat
     if thermostat is not None and hasattr(thermostat, "for_stage"):
         thermostat = thermostat.for_stage(system, k)
     elif thermostat is None and stage.has_thermostat:
         thermostat = thermostat_of(system, k)
-    elif thermostat is None and not stage.has_barostat and couplings.DEFAULT_THERMOSTAT in kinds:
-        # An idle thermostat, so that all stages run the same machine code.
-        thermostat = VelocityRescaling(constant_ramp(0.0), inf, system.freedom.total, key_of(scene.seed, THERMOSTAT, k))
     if stage.is_hybrid and system.thermostat is None:
         found = found.with_trajectories(thermostat_of(system, k), stage.steps_together)
     elif thermostat is not None:

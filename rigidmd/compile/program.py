@@ -77,6 +77,17 @@ class Program:
 
 
 @kernel
+def run_row(rows, k):
+    """Call pass k; returns its status."""
+    rows.status[0] = 0
+    if rows.blocks[k] == 1:
+        call_address(rows.address[k], rows.arguments[k], 0)
+    else:
+        run_on_all_threads(rows.address[k], rows.arguments[k], rows.blocks[k])
+    return rows.status[0]
+
+
+@kernel
 def run_passes(rows, arguments, when):
     """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0. arguments : their
     addresses, of `rows` or others"""

@@ -1,8 +1,8 @@
-"""Barostats: flows that change the cell at a pressure, chosen by type; a constant volume compiles none.
+"""Barostats: flows that change the cell at a pressure, each a pass of the step; a constant volume has none.
 
 See the theory chapter `sampling`. A lower triangular matrix T multiplies the cell (rows a, b, c) and the centres of
 mass from the right. The virial is W_ij = sum F_i R_j in `tally[1:]`. `apply_barostat` acts where a scheme has the flow
-BAROSTAT, `scale_box` where it has SCALE_BOX. The energy added to the molecules is in `state.energy_ledger[WORK]`.
+BAROSTAT, `move_piston` where it has SCALE_BOX. The energy added to the molecules is in `state.energy_ledger[WORK]`.
 """
 
 from math import exp, log, sqrt
@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import chosen_by_type, implements, is_a, kernel
+from rigidmd.compile import Pass, chosen_by_type, implements, is_a, kernel, load_arguments, task
 from rigidmd.core.integrators import BAROSTAT
 from rigidmd.core.state import NOW, OK, ORIGIN, TALLY_SIZE, WORK, Load, State, no_load
 from rigidmd.dynamics.noise import Key, normals, uniforms
+from rigidmd.dynamics.registers import LOADED, TRIAL, Registers
 from rigidmd.dynamics.thermostats import Ramp, ramp_value, scale_array, translational_energy
 from rigidmd.forces.neighbors.space import volume_of
-from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, compute_load, copy
+from rigidmd.forces.terms import WITH_ENERGIES, WITH_VIRIALS, TermTable, compute_load, copy
 
 #: Components of strains and pressures, in this order: (row, column) of the lower triangle.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))
@@ -44,10 +45,6 @@ class Pressure(NamedTuple):
     first: tuple[float, float, float, float, float, float]
     last: tuple[float, float, float, float, float, float]
     steps: float
-
-
-class NoBarostat(NamedTuple):
-    rate: float = 0.0
 
 
 class CellRescaling(NamedTuple):
@@ -139,27 +136,28 @@ def barostat_workspace(state: State) -> BarostatWorkspace:
     )  # fmt: skip
 
 
-@chosen_by_type(inline=True)
-def compute_step_load(barostat, terms, state, load, workspace, flows, which):
+def needed_tallies(barostat: tuple | None) -> int:
+    """What `compute_load` has to compute in a step in which a barostat acts: WITH_VIRIALS or WITH_ENERGIES; 0: no more
+    than in other steps."""
+    if barostat is None:
+        return 0
+    return WITH_VIRIALS if isinstance(barostat, Piston) else WITH_ENERGIES
+
+
+@kernel(inline=True)
+def compute_step_load(terms, state, load, registers, flows, which):
     """Forces and torques at the present positions; a status code.
 
     which : FORCES_ONLY or WITH_ENERGIES (and virials). A step in which the barostat acts always computes virials, and
         energies if the move depends on them
     """
-    if is_a(barostat, NoBarostat):
-        return lambda barostat, terms, state, load, workspace, flows, which: compute_load(terms, state, load, which)
-
-    needed = WITH_VIRIALS if is_a(barostat, Piston) else WITH_ENERGIES
-
-    def with_virials(barostat, terms, state, load, workspace, flows, which):
-        workspace.known[0] = 0
+    registers.known[0] = 0
+    if flows.tallies != 0:
         for k in range(len(flows.kind)):
             if flows.kind[k] == BAROSTAT and (state.step[NOW] - state.step[ORIGIN] + 1) % flows.every[k] == 0:
-                energies = which == WITH_ENERGIES
-                return compute_load_and_virial(terms, state, load, workspace, which if energies else needed)
-        return compute_load(terms, state, load, which)
-
-    return with_virials
+                needed = which if which == WITH_ENERGIES else flows.tallies
+                return compute_load_and_virial(terms, state, load, registers, needed)
+    return compute_load(terms, state, load, which)
 
 
 @kernel(inline=True)
@@ -175,38 +173,57 @@ def compute_load_and_virial(terms, state, load, workspace, which):
     return status
 
 
-@chosen_by_type
-def scale_box(barostat, state, h):
+@kernel
+def move_piston(barostat, state, h):
     """The flow of the volume by the inertia of a piston, in place."""
-    if not is_a(barostat, Piston):
-        return lambda barostat, state, h: None
-
-    def move_piston(barostat, state, h):
-        volume = volume_of(state.cell)
-        after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
-        scale = (after / volume) ** (1 / 3)
-        scale_array(state.position, scale)
-        scale_array(state.velocity, 1 / scale)
-        scale_array(state.cell, scale)
-        state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
-
-    return move_piston
+    volume = volume_of(state.cell)
+    after = volume + h * barostat.inverse_mass * state.extra_variables[-1]
+    scale = (after / volume) ** (1 / 3)
+    scale_array(state.position, scale)
+    scale_array(state.velocity, 1 / scale)
+    scale_array(state.cell, scale)
+    state.energy_ledger[WORK] -= target_pressure(barostat.pressure, state, 0) * (after - volume)
 
 
 @chosen_by_type
 def apply_barostat(barostat, model, terms, state, load, workspace, progress, h, draw):
-    """The flow of a barostat over a time h, in place; a status code. progress : see `advance`."""
-    if is_a(barostat, NoBarostat):
-        return lambda barostat, model, terms, state, load, workspace, progress, h, draw: OK
+    """The flow of a barostat over a time h, in place; a status code. progress : see `registers`."""
     return _kick_piston if is_a(barostat, Piston) else _try_move
 
 
+@task()
+def _apply_barostat(arguments, block):
+    barostat, model, terms, state, load, workspace, registers, status = load_arguments(arguments)
+    h, draw = registers.h[0], registers.draw[0]
+    status[0] = apply_barostat(barostat, model, terms, state, load, workspace, registers.progress, h, draw)
+
+
+@task()
+def _move_piston(arguments, block):
+    barostat, state, registers = load_arguments(arguments)
+    move_piston(barostat, state, registers.h[0])
+    registers.progress[LOADED] = 0
+
+
+def barostat_pass(
+    barostat: NamedTuple, model: NamedTuple, terms: TermTable, state: State, load: Load,
+    workspace: BarostatWorkspace, registers: Registers, status: np.ndarray,
+) -> Pass:  # fmt: skip
+    """`apply_barostat` over the time in the registers."""
+    return Pass("barostat", _apply_barostat, (barostat, model, terms, state, load, workspace, registers, status))
+
+
+def piston_pass(barostat: Piston, state: State, registers: Registers) -> Pass:
+    """`move_piston` over the time in the registers."""
+    return Pass("volume", _move_piston, (barostat, state, registers))
+
+
 def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if progress[1] != 1 or workspace.known[0] == 0:
+    if progress[LOADED] != 1 or workspace.known[0] == 0:
         status = compute_load_and_virial(terms, state, load, workspace, WITH_VIRIALS)
         if status != OK:
             return status
-        progress[1] = 1
+        progress[LOADED] = 1
     volume = volume_of(state.cell)
     virial = workspace.tally[0, 1] + workspace.tally[0, 5] + workspace.tally[0, 9]
     pressure = (2 * translational_energy(model, state) + virial) / (3 * volume) + barostat.tail[1] / volume**2
@@ -217,23 +234,23 @@ def _kick_piston(barostat, model, terms, state, load, workspace, progress, h, dr
 
 
 def _try_move(barostat, model, terms, state, load, workspace, progress, h, draw):
-    if progress[2] == 0:
-        if progress[1] != 1 or workspace.known[0] == 0:
-            progress[1] = 0
+    if progress[TRIAL] == 0:
+        if progress[LOADED] != 1 or workspace.known[0] == 0:
+            progress[LOADED] = 0
             status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
             if status != OK:
                 return status
-            progress[1] = 1
+            progress[LOADED] = 1
         if not propose_strain(barostat, model, state, workspace, h, draw):
             workspace.counts[0] += 1
             return OK
         copy_moved(state, load, workspace, workspace.load, workspace.tally[0], workspace.tally[1])
         apply_strain(barostat, state, workspace)
-        progress[2] = 1
+        progress[TRIAL] = 1
     status = compute_load_and_virial(terms, state, load, workspace, WITH_ENERGIES)
     if status != OK:
         return status
-    progress[2] = 0
+    progress[TRIAL] = 0
     chance = log_acceptance(barostat, model, state, workspace, h)
     u, _ = uniforms(barostat.key, draw + 8, 0, state.step[NOW])
     workspace.counts[0] += 1

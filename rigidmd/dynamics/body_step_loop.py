@@ -1,15 +1,27 @@
-"""The flows of a single body. Each part is chosen by its type, so only what a scene has is compiled."""
+"""The step loop of a single body, and its flows. The types choose each part, so only what a scene has is compiled."""
 
 # isort: skip_file
 from typing import NamedTuple
 
-from rigidmd.compile import implements, kernel
-from rigidmd.core.state import NOW, WORK
-from rigidmd.dynamics.force_gradient import add_gyration, displace
-from rigidmd.dynamics.step_loop import accumulate_work, drift, kick
+from numba import types
+
+from rigidmd.compile import chosen_by_type, implements, kernel
+from rigidmd.core.integrators import KICK
+from rigidmd.core.state import NOW, OK, ORIGIN, WORK
+from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
+from rigidmd.dynamics.registers import DONE, LOADED
+from rigidmd.dynamics.step_loop import ORTHOGONALITY_INTERVAL
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
-from rigidmd.forces.terms import total_power
-from rigidmd.mechanics.free_rotor import DrivenRotor, ExactRotor, NoRotor, SplitRotor, moments, rotate_by_vector
+from rigidmd.forces.terms import compute_body_load, total_power
+from rigidmd.mechanics.free_rotor import (
+    DrivenRotor,
+    ExactRotor,
+    NoRotor,
+    SplitRotor,
+    moments,
+    restore_orthogonality,
+    rotate_by_vector,
+)
 from rigidmd.mechanics.translation import (
     FluidTranslation, FreeTranslation, InertialFrame, NoTranslation, RotatingFrame, body_component, body_vector,
     frame_rate, inertial_mass, lab_vector, rotate_with_frame, translate,
@@ -25,17 +37,58 @@ class Body(NamedTuple):
     resistance: NoResistance | Resistance = NoResistance()
 
 
-@implements(kick, Body, inline=True)
-def _kick_body(model, code, state, load, pending, h):
-    kick_with_resistance(model.resistance, model.translation, model.rotor, model.frame, state, load, h)
-    return pending
+@kernel(from_python=True)
+def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until, progress):
+    """Take steps of dt of a body until state.step is `until`. Returns a status code, after which another call continues
+    exactly where this one stopped.
+
+    terms : a tuple of workspaces; flows : see `step_loop.FlowArrays`; progress : see `registers`
+    gradient_workspace : None compiles no kicks with gradients
+    """
+    while state.step[NOW] < until:
+        while progress[DONE] < len(flows.kind):
+            k = progress[DONE]
+            h = flows.fraction[k] * dt
+            if flows.kind[k] == KICK:
+                needed = 1
+                if gradient_workspace is not None and flows.gradient[k] != 0.0:
+                    needed = 2
+                while progress[LOADED] < needed:
+                    status = _evaluate(
+                        model, state, load, terms, flows, gradient_workspace, k, dt, progress[LOADED] == 1
+                    )
+                    if status != OK:
+                        return status
+                    progress[LOADED] += 1
+                accumulate_work(model, terms, state, 0.5 * h)
+                kick_with_resistance(model.resistance, model.translation, model.rotor, model.frame, state, load, h)
+                accumulate_work(model, terms, state, 0.5 * h)
+            else:
+                time = state.time[NOW]
+                translate(model.translation, model.rotor, state, time, h)
+                rotate_with_frame(model.frame, state, time, h)
+                state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
+                progress[LOADED] = 0
+                if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
+                    restore_orthogonality(state.rotation, state.angular_momentum_body)
+            progress[DONE] += 1
+        progress[DONE] = 0
+        state.step[NOW] += 1
+    return OK
 
 
-@implements(drift, Body, inline=True)
-def _drift_body(model, code, state, load, pending, h):
-    time = state.time[NOW]
-    translate(model.translation, model.rotor, state, time, h)
-    rotate_with_frame(model.frame, state, time, h)
+@chosen_by_type
+def _evaluate(model, state, load, terms, flows, gradient_workspace, k, dt, known):
+    """The forces before kick k; or, if they are known, the addition of their gradient. A status code."""
+    if isinstance(gradient_workspace, types.NoneType):
+        return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: compute_body_load(
+            terms, state, load
+        )
+
+    def with_gradient(model, state, load, terms, flows, gradient_workspace, k, dt, known):
+        return evaluate(model, state, load, terms, gradient_workspace, flows.gradient[k] * dt * dt, known)
+
+    return with_gradient
 
 
 @implements(displace, Body, inline=True)
@@ -59,8 +112,10 @@ def _add_gyration_of_body(model, load, tau, gain):
         gain.torque_body[b, 2] += tau * (i0 - i1) * n[0] * n[1]
 
 
-@implements(accumulate_work, Body, chooses=True, inline=True)
-def _accumulate_work_of_body(model, terms, state, h):
+@chosen_by_type(inline=True)
+def accumulate_work(model, terms, state, h):
+    """Add the work of time-dependent terms over h to the energy ledger, half before a kick and half after it: their
+    power at the present velocity."""
     if not any(getattr(term.instance_class, "time_dependent", False) for term in terms.types):
         return lambda model, terms, state, h: None
 

@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.compile import chosen_by_type, is_a, kernel
+from rigidmd.compile import Code, Pass, kernel, load_arguments, task
+from rigidmd.core.integrators import BEGIN_TRAJECTORY, END_TRAJECTORY
 from rigidmd.core.state import BEHIND_WALL, HEAT, NOT_FINITE, NOW, OK, Load, State, no_load
 from rigidmd.dynamics.noise import uniforms
-from rigidmd.dynamics.thermostats import HybridMonteCarlo, kinetic_energies_of, ramp_value
-from rigidmd.forces.terms import WITH_ENERGIES, compute_load, copy
+from rigidmd.dynamics.registers import AFTER_BAROSTAT, FAILED, LOADED, Registers
+from rigidmd.dynamics.thermostats import kinetic_energies_of, ramp_value
+from rigidmd.forces.terms import WITH_ENERGIES, TermTable, compute_load, copy
 
 #: Columns of `TrajectoryWorkspace.sums`: trajectories ended and accepted; sums of abs(dH)/kT, of min(1, exp(-dH/kT)),
 #: and of exp(-dH/kT), whose mean is 1 in equilibrium.
@@ -49,38 +51,27 @@ def trajectory_workspace(state: State) -> TrajectoryWorkspace:
 def potential_energy(terms, state, load, progress):
     """Status code and potential energy of the present positions, with forces if these are unknown. progress : see
     `dynamics.step_loop.advance`"""
-    if progress[1] != 1 or terms.tallies_valid[0] == 0:
-        progress[1] = 0
+    if progress[LOADED] != 1 or terms.tallies_valid[0] == 0:
+        progress[LOADED] = 0
         status = compute_load(terms, state, load, WITH_ENERGIES)
         if status != OK:
             return status, 0.0
-        progress[1] = 1
+        progress[LOADED] = 1
     total = 0.0
     for tally in terms.tallies:
         total += tally[0]
     return OK, total
 
 
-@chosen_by_type
+@kernel
 def start_or_test_trajectory(
-    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
+    thermostat, model, code, terms, state, load, blocks, workspace, registers, starts, draw
 ):  # fmt: skip
     """Keep the present state as the start of a trajectory; or accept it as its end, or return to the start. A status
     code. blocks : see `thermostat_workspace`"""
-    return _start_or_test if is_a(thermostat, HybridMonteCarlo) else _do_nothing
-
-
-def _do_nothing(
-    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
-):  # fmt: skip
-    return OK
-
-
-def _start_or_test(
-    thermostat, model, code, terms, state, load, blocks, workspace, barostat_workspace, progress, starts, draw
-):  # fmt: skip
+    progress = registers.progress
     potential = workspace.energies[0]
-    if not starts or workspace.known[0] == 0 or progress[1] != 1:
+    if not starts or workspace.known[0] == 0 or progress[LOADED] != 1:
         status, potential = potential_energy(terms, state, load, progress)
         if not starts and diverges(workspace, status):
             rest_at_start(workspace, state, load)
@@ -112,26 +103,8 @@ def _start_or_test(
         negate(state.velocity)
         negate(state.angular_momentum_body)
         terms.tallies_valid[0] = 0
-        if barostat_workspace is not None:
-            barostat_workspace.known[0] = 0
+        registers.known[0] = 0
     return OK
-
-
-@chosen_by_type
-def rest_if_diverged(workspace, state, load, progress, status):
-    """The status code of an evaluation of forces. In a trajectory, NOT_FINITE and BEHIND_WALL become OK: it diverges,
-    and rests at its start, with the forces there unknown, until it is rejected."""
-    if not is_a(workspace, TrajectoryWorkspace):
-        return lambda workspace, state, load, progress, status: status
-
-    def rest(workspace, state, load, progress, status):
-        if not diverges(workspace, status):
-            return status
-        rest_at_start(workspace, state, load)
-        progress[1] = 0
-        return OK
-
-    return rest
 
 
 @kernel
@@ -146,25 +119,43 @@ def rest_at_start(workspace, state, load):
     copy_start(workspace, workspace.load, state, load)
 
 
-@chosen_by_type(inline=True)
-def time_moved(workspace, h):
-    """The time of a kick or a drift: h, or 0 while a diverged trajectory rests."""
-    if not is_a(workspace, TrajectoryWorkspace):
-        return lambda workspace, h: h
-    return lambda workspace, h: 0.0 if workspace.diverged[0] != 0 else h
+@task()
+def _start_or_test(arguments, block):
+    everything, registers, status, starts = load_arguments(arguments)
+    status[0] = start_or_test_trajectory(*everything, registers, starts, registers.draw[0])
 
 
-@chosen_by_type
-def know_potential(thermostat, workspace, barostat_workspace):
+@task()
+def _rest(arguments, block):
+    """After forces that failed. If a trajectory diverges, it rests at its start, where the forces are unknown, until it
+    is rejected; the status becomes OK."""
+    workspace, state, load, registers = load_arguments(arguments)
+    if diverges(workspace, registers.failure[0]):
+        rest_at_start(workspace, state, load)
+        registers.progress[LOADED] = 0
+        registers.failure[0] = OK
+
+
+@task()
+def _know_potential(arguments, block):
     """Take the potential energy from a move of the box that has just been accepted or rejected."""
-    if not is_a(thermostat, HybridMonteCarlo):
-        return lambda thermostat, workspace, barostat_workspace: None
+    workspace, registers = load_arguments(arguments)
+    workspace.energies[0] = registers.tally[0, 0]
 
-    def know(thermostat, workspace, barostat_workspace):
-        if barostat_workspace is not None:
-            workspace.energies[0] = barostat_workspace.tally[0, 0]
 
-    return know
+def trajectory_passes(
+    thermostat: NamedTuple, model: NamedTuple, code: Code, terms: TermTable, state: State, load: Load,
+    blocks: np.ndarray, workspace: TrajectoryWorkspace, registers: Registers, status: np.ndarray,
+) -> dict[int, Pass]:  # fmt: skip
+    """Kind of a flow -> its pass: the start and the test of a trajectory; what follows a move of the box; and, as
+    FAILED, what follows forces that failed."""
+    everything = (thermostat, model, code, terms, state, load, blocks, workspace)
+    return {
+        BEGIN_TRAJECTORY: Pass("start of a trajectory", _start_or_test, (everything, registers, status, True)),
+        END_TRAJECTORY: Pass("test of a trajectory", _start_or_test, (everything, registers, status, False)),
+        AFTER_BAROSTAT: Pass("potential energy of the box", _know_potential, (workspace, registers)),
+        FAILED: Pass("rest at the start", _rest, (workspace, state, load, registers)),
+    }
 
 
 @kernel

@@ -1,4 +1,7 @@
-"""The compiled loop over steps, for any sequence of flows, any force terms, any thermostat and any barostat."""
+"""The compiled loop over steps of molecules, for any sequence of flows, any forces, any thermostat and any barostat.
+
+The loop is compiled once: forces, thermostat, barostat and trajectories are passes, which it calls by address.
+"""
 
 # isort: skip_file
 from typing import NamedTuple
@@ -6,22 +9,43 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import (
-    BoundTask, Code, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments, pack_arguments, task,
-)  # fmt: skip
-from rigidmd.core.integrators import (
-    BAROSTAT, BEGIN_TRAJECTORY, DRIFT, END_TRAJECTORY, KICK, SCALE_BOX, THERMOSTAT, Scheme,
-)  # fmt: skip
-from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK
-from rigidmd.dynamics.barostats import apply_barostat, compute_step_load, scale_box
-from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
-from rigidmd.dynamics.hybrid_monte_carlo import (
-    know_potential, rest_if_diverged, start_or_test_trajectory, time_moved,
-)  # fmt: skip
+    ALWAYS,
+    BoundTask,
+    Code,
+    Pass,
+    Program,
+    call_blocks,
+    implements,
+    kernel,
+    load_arguments,
+    pack_arguments,
+    run_row,
+    task,
+)
+from rigidmd.core.integrators import BAROSTAT, DRIFT, KICK, REMOVE_MOMENTUM, SCALE_BOX, THERMOSTAT, Scheme
+from rigidmd.core.state import EXAMPLE, NOW, OK, ORIGIN, REMOVED, WORK, Load, State
+from rigidmd.dynamics.barostats import (
+    BarostatWorkspace,
+    barostat_pass,
+    compute_step_load,
+    needed_tallies,
+    piston_pass,
+)
+from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, displace, evaluate
+from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_passes
 from rigidmd.dynamics.model import Model
-from rigidmd.dynamics.observables import SUM_COUNT, LargestValues, StateSums, fill_sums, find_largest, unpack_sums
-from rigidmd.dynamics.thermostats import apply_thermostat, thermostat_code
+from rigidmd.dynamics.observables import (
+    SUM_COUNT,
+    LargestValues,
+    StateSums,
+    fill_sums,
+    find_largest,
+    unpack_sums,
+)
+from rigidmd.dynamics.registers import AFTER_BAROSTAT, DONE, FAILED, LOADED, Registers, new_registers
+from rigidmd.dynamics.thermostats import thermostat_code, thermostat_pass
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
-from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, total_energy_rate
+from rigidmd.forces.terms import FORCES_ONLY, WITH_ENERGIES, TermTable, total_energy_rate
 from rigidmd.mechanics.batches import LANES, kick_group, rotate_group
 from rigidmd.mechanics.free_rotor import restore_orthogonality, rotate_by_vector
 
@@ -37,14 +61,11 @@ ORTHOGONALITY_INTERVAL = 256
 CACHE_GROUP = 32 * LANES
 
 
-def molecule_code(model: NamedTuple, thermostat: tuple) -> Code | None:
-    """The machine code that moves molecules; None of a single body, whose flows are compiled into the loop."""
-    if not isinstance(model, Model):
-        return None
+def move_code(model: Model) -> Code:
+    """The machine code of kicks and drifts of molecules."""
     state, load = EXAMPLE
     bodies = (model.rotor, model.species, model.inverse_mass, model.inverse_inertia)
-    move = (_move, (*bodies, state, load, NO_PENDING_KICKS, 0.0, False))
-    return Code(move=move, **thermostat_code(thermostat, model))
+    return Code(move=(_move, (*bodies, state, load, NO_PENDING_KICKS, 0.0, False)))
 
 
 class FlowArrays(NamedTuple):
@@ -55,106 +76,142 @@ class FlowArrays(NamedTuple):
     moment: np.ndarray  # (flows,) the sum of the fractions of the drifts up to each flow
     every: np.ndarray  # (flows,) the interval in steps at which the flow acts,
     phase: np.ndarray  # (flows,) at its begin, 0, or at its end, 1
+    row: np.ndarray  # (flows,) of its pass, see `Couplings`; -1 for kicks and drifts
     gradient: np.ndarray | None  # (flows,) of dt²; None (not compiled) where no kick has a gradient
     last: int  # index of the last drift
     trajectory: int  # steps of a trajectory of hybrid Monte Carlo, or 0
+    tallies: int  # what a step with a barostat computes, see `needed_tallies`
+    after_barostat: int  # row of the pass after a move of the box, or -1
+    failed: int  # row of the pass after forces that failed, or -1
 
 
-def flow_arrays(scheme: Scheme) -> FlowArrays:
+def flow_arrays(scheme: Scheme, rows: dict[int, int] | None = None) -> FlowArrays:
+    """rows : kind of a flow -> row of its pass"""
+    rows = rows or {}
     kind = np.array([flow.kind for flow in scheme.flows])
     fraction = np.array([flow.fraction for flow in scheme.flows])
     moment = np.cumsum(np.where(kind == DRIFT, fraction, 0.0))
     last = int(np.flatnonzero(kind == DRIFT)[-1])
     moment[last:] = 1.0
-    gradient = np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None
-    every, phase = (np.array([getattr(flow, name) for flow in scheme.flows]) for name in ("every", "phase"))
-    return FlowArrays(kind, fraction, moment, every, phase, gradient, last, scheme.trajectory_steps)
+    return FlowArrays(
+        kind=kind,
+        fraction=fraction,
+        moment=moment,
+        every=np.array([flow.every for flow in scheme.flows]),
+        phase=np.array([flow.phase for flow in scheme.flows]),
+        row=np.array([rows.get(flow.kind, -1) for flow in scheme.flows]),
+        gradient=np.array([flow.gradient for flow in scheme.flows]) if scheme.has_gradient else None,
+        last=last,
+        trajectory=scheme.trajectory_steps,
+        tallies=needed_tallies(scheme.barostat),
+        after_barostat=rows.get(AFTER_BAROSTAT, -1),
+        failed=rows.get(FAILED, -1),
+    )
+
+
+class CouplingWorkspaces(NamedTuple):
+    """What the flows of a scheme besides kicks and drifts remember; None of what it has not."""
+
+    heat: np.ndarray  # see `thermostat_workspace`
+    box: BarostatWorkspace | None
+    trajectory: TrajectoryWorkspace | None
+
+
+def coupling_passes(
+    scheme: Scheme, model: Model, terms: TermTable, state: State, load: Load, workspaces: CouplingWorkspaces,
+    registers: Registers, status: np.ndarray,
+) -> dict[int, Pass]:  # fmt: skip
+    """Kind of a flow of a scheme -> its pass, for all flows besides kicks and drifts."""
+    heat, box, trajectory = workspaces
+    kinds = {flow.kind for flow in scheme.flows}
+    thermostat, barostat = scheme.thermostat, scheme.barostat
+    code = thermostat_code(thermostat, model)
+    found = {REMOVE_MOMENTUM: Pass("removal of momentum", _remove_momentum, (model, state))}
+    if thermostat is not None:
+        found[THERMOSTAT] = thermostat_pass(thermostat, model, code, state, heat, registers)
+    if box is not None:
+        found[BAROSTAT] = barostat_pass(barostat, model, terms, state, load, box, registers, status)
+        found[SCALE_BOX] = piston_pass(barostat, state, registers)
+    if trajectory is not None:
+        kinds |= {FAILED} | ({AFTER_BAROSTAT} if box is not None else set())
+        found |= trajectory_passes(thermostat, model, code, terms, state, load, heat, trajectory, registers, status)
+    return {kind: one for kind, one in found.items() if kind in kinds}
 
 
 @kernel
-def advance(
-    model, code, state, load, terms, thermostat, barostat, flows, gradient_workspace, thermostat_workspace,
-    barostat_workspace, trajectory_workspace, dt, until, observed, progress
-):  # fmt: skip
-    """Take steps of dt until state.step is `until`. Returns a status code.
+def advance(model, code, state, load, terms, couplings, flows, registers, gradient_workspace, dt, until, observed):
+    """Take steps of dt of molecules until state.step is `until`. Returns a status code.
 
-    code : see `molecule_code`
-    terms : the workspaces of a body, or the `TermTable` of molecules
-    flows : see `FlowArrays`. gradient_workspace : None compiles no kicks with gradients
+    code : see `move_code`
+    terms : `TermTable`; couplings : `Rows` of thermostat, barostat and trajectories; flows : see `FlowArrays`
+    gradient_workspace : None compiles no kicks with gradients
     observed : whether energies and virials are computed with the last forces, if a kick needs these
-    progress (3,) : flows done in this step; whether `load` belongs to the present positions (1), with the gradient
-        added (2); whether a barostat move has been made and is not yet accepted or rejected
 
     Forces are evaluated before a kick if positions have changed since, so the last evaluation of a step serves the next
-    step. Kicks of molecules are pending until the next drift: the last kick of a step and the first of the next are
-    done in one pass with the drift. If the status is not OK, state and progress are such that another call continues
-    exactly where this one stopped.
+    step. Kicks are pending until the next drift: the last kick of a step and the first of the next are done in one pass
+    with the drift. If the status is not OK, state and registers are such that another call continues exactly where this
+    one stopped.
     """
-    pending = NO_PENDING_KICKS
+    pending, progress = NO_PENDING_KICKS, registers.progress
     while state.step[NOW] < until:
-        while progress[0] < len(flows.kind):
-            k = progress[0]
+        while progress[DONE] < len(flows.kind):
+            k = progress[DONE]
             h = flows.fraction[k] * dt
+            moved = 0.0 if registers.resting[0] != 0 else h
             if flows.kind[k] == KICK:
                 if gradient_workspace is None:
-                    while progress[1] == 0:
+                    while progress[LOADED] == 0:
                         now = state.step[NOW] + 1
                         needed = (observed and now == until) or is_tested(flows, now - state.step[ORIGIN])
                         which = WITH_ENERGIES if needed and k > flows.last else FORCES_ONLY
-                        status = compute_step_load(barostat, terms, state, load, barostat_workspace, flows, which)
-                        progress[1] = 1 if status == OK else 0
-                        status = rest_if_diverged(trajectory_workspace, state, load, progress, status)
+                        status = compute_step_load(terms, state, load, registers, flows, which)
+                        progress[LOADED] = 1 if status == OK else 0
+                        status = after_forces(couplings, flows, registers, status)
                         if status != OK:
                             return status
                 else:
-                    while progress[1] < (1 if flows.gradient[k] == 0.0 else 2):
+                    while progress[LOADED] < (1 if flows.gradient[k] == 0.0 else 2):
                         pending = apply_pending_kicks(model, code, state, load, pending)
-                        tau, known = flows.gradient[k] * dt * dt, progress[1] == 1
+                        tau, known = flows.gradient[k] * dt * dt, progress[LOADED] == 1
                         status = evaluate(model, state, load, terms, gradient_workspace, tau, known)
-                        progress[1] += status == OK
-                        status = rest_if_diverged(trajectory_workspace, state, load, progress, status)
+                        progress[LOADED] += status == OK
+                        status = after_forces(couplings, flows, registers, status)
                         if status != OK:
                             return status
-                h = time_moved(trajectory_workspace, h)
-                accumulate_work(model, terms, state, 0.5 * h)
-                pending = kick(model, code, state, load, pending, h)
-                accumulate_work(model, terms, state, 0.5 * h)
+                moved = 0.0 if registers.resting[0] != 0 else h
+                state.energy_ledger[WORK] += 0.5 * moved * total_energy_rate(terms)
+                pending = kick(model, code, state, load, pending, moved)
+                state.energy_ledger[WORK] += 0.5 * moved * total_energy_rate(terms)
             elif flows.kind[k] == DRIFT:
-                drift(model, code, state, load, pending, time_moved(trajectory_workspace, h))
+                _move_all(model, code, state, load, pending, moved, True)
                 pending = NO_PENDING_KICKS
                 state.time[NOW] = state.time[ORIGIN] + (state.step[NOW] - state.step[ORIGIN] + flows.moment[k]) * dt
-                progress[1] = 0
+                progress[LOADED] = 0
                 if k == flows.last and (state.step[NOW] + 1) % ORTHOGONALITY_INTERVAL == 0:
                     restore_orthogonality(state.rotation, state.angular_momentum_body)
             elif (state.step[NOW] - state.step[ORIGIN] + flows.phase[k]) % flows.every[k] == 0:
                 pending = apply_pending_kicks(model, code, state, load, pending)
-                if flows.kind[k] == THERMOSTAT:
-                    apply_thermostat(thermostat, model, code, state, thermostat_workspace, h, DRAWS * k)
-                elif flows.kind[k] == BAROSTAT:
-                    status = apply_barostat(
-                        barostat, model, terms, state, load, barostat_workspace, progress, h, DRAWS * k
-                    )
-                    if status != OK:
-                        return status
-                    know_potential(thermostat, trajectory_workspace, barostat_workspace)
-                elif flows.kind[k] == BEGIN_TRAJECTORY or flows.kind[k] == END_TRAJECTORY:
-                    starts = flows.kind[k] == BEGIN_TRAJECTORY
-                    status = start_or_test_trajectory(
-                        thermostat, model, code, terms, state, load, thermostat_workspace, trajectory_workspace,
-                        barostat_workspace, progress, starts, DRAWS * k
-                    )  # fmt: skip
-                    if status != OK:
-                        return status
-                elif flows.kind[k] == SCALE_BOX:
-                    scale_box(barostat, state, h)
-                    progress[1] = 0
-                else:
-                    remove_momentum_flow(model, state)
-            progress[0] += 1
-        progress[0] = 0
+                registers.h[0], registers.draw[0] = h, DRAWS * k
+                status = run_row(couplings, flows.row[k])
+                if status == OK and flows.kind[k] == BAROSTAT and flows.after_barostat >= 0:
+                    status = run_row(couplings, flows.after_barostat)
+                if status != OK:
+                    return status
+            progress[DONE] += 1
+        progress[DONE] = 0
         state.step[NOW] += 1
     apply_pending_kicks(model, code, state, load, pending)
     return OK
+
+
+@kernel
+def after_forces(couplings, flows, registers, status):
+    """The status code after an evaluation of forces: what failed in a trajectory may be no failure of the run."""
+    if status == OK or flows.failed < 0:
+        return status
+    registers.failure[0] = status
+    run_row(couplings, flows.failed)
+    return registers.failure[0]
 
 
 @kernel(inline=True)
@@ -163,23 +220,33 @@ def is_tested(flows, step):
     return flows.trajectory > 0 and step % flows.trajectory == 0
 
 
-#: Indices of `Advance._integers`: `until` and `observed` of `advance`, its status, and the three numbers of `progress`.
-UNTIL, OBSERVED, STATUS, PROGRESS = 0, 1, 2, 3
-
-
 class Advance:
-    """`advance` of molecules, for Python: bound to all of its arguments but dt, `until`, `observed` and `progress`. At
-    the end it also sums over the state and its load, while these are in the caches of the cores."""
+    """`advance` of molecules, for Python: bound to all that it works on. At the end it also sums over the state and its
+    load, while these are in the caches of the cores.
 
-    def __init__(self, *arguments):
-        self._dt, self._integers = np.zeros(1), np.zeros(PROGRESS + 3, np.int64)
+    terms : the `TermTable`, bound to the state and the load
+    """
+
+    def __init__(
+        self, scheme: Scheme, model: Model, state: State, load: Load, terms: TermTable,
+        workspaces: CouplingWorkspaces, gradient: GradientWorkspace | None,
+    ):  # fmt: skip
+        self._registers = registers = registers_of(workspaces)
+        status = np.zeros(1, np.int64)
+        passes = coupling_passes(scheme, model, terms, state, load, workspaces, registers, status)
+        self._couplings = Program(list(passes.values()), ALWAYS, status)
+        self._couplings.bind(list(passes.values()))
+        flows = flow_arrays(scheme, {kind: row for row, kind in enumerate(passes)})
+        bound = (model, move_code(model), state, load, terms, self._couplings.rows, flows, registers, gradient)
+        self._dt, self._integers = np.zeros(1), np.zeros(3, np.int64)
         self._extent, self._sums = np.zeros(len(LargestValues._fields)), np.zeros(SUM_COUNT)
-        self._call = BoundTask(_advance, (arguments, self._dt, self._integers, self._extent, self._sums))
+        self._call = BoundTask(_advance, (bound, self._dt, self._integers, self._extent, self._sums))
 
     def begin(self, dt: float, until: int, observed: bool, loaded: bool) -> None:
         """Set what the next calls do. loaded : whether the load belongs to the present positions"""
         self._dt[0] = dt
-        self._integers[:] = until, observed, OK, 0, loaded, 0
+        self._integers[:] = until, observed, OK
+        self._registers.progress[:] = 0, loaded, 0
 
     def __call__(self) -> int:
         """Start or continue; a status code."""
@@ -189,7 +256,7 @@ class Advance:
     @property
     def loaded(self) -> bool:
         """Whether the load belongs to the present positions."""
-        return self._integers[PROGRESS + 1] != 0
+        return self._registers.progress[LOADED] != 0
 
     @property
     def extent(self) -> LargestValues:
@@ -202,17 +269,25 @@ class Advance:
         return unpack_sums(self._sums) if self._integers[OBSERVED] else None
 
 
-@kernel(from_python=True)
-def advance_body(*arguments):
-    """`advance` of a body, for Python."""
-    return advance(*arguments)
+def registers_of(workspaces: CouplingWorkspaces) -> Registers:
+    """New registers, which share what a barostat and trajectories remember."""
+    found = new_registers()
+    if workspaces.box is not None:
+        found = found._replace(tally=workspaces.box.tally, known=workspaces.box.known)
+    if workspaces.trajectory is not None:
+        found = found._replace(resting=workspaces.trajectory.diverged)
+    return found
+
+
+#: Indices of `Advance._integers`: `until` and `observed` of `advance`, and its status.
+UNTIL, OBSERVED, STATUS = 0, 1, 2
 
 
 @task()
 def _advance(arguments, block):
     bound, dt, integers, extent, sums = load_arguments(arguments)
     model, _, state, load = bound[:4]
-    integers[STATUS] = advance(*bound, dt[0], integers[UNTIL], integers[OBSERVED] != 0, integers[PROGRESS:])
+    integers[STATUS] = advance(*bound, dt[0], integers[UNTIL], integers[OBSERVED] != 0)
     if integers[STATUS] == OK:
         find_largest(
             state.position.ravel(), state.velocity.ravel(), state.rotation.ravel(),
@@ -225,45 +300,30 @@ def _advance(arguments, block):
             )  # fmt: skip
 
 
-def kick(model, code, state, load, pending, h):
-    """Exact flow of the potential, in place: V += h F/m, L += h n_body. Returns the pending kicks. A body is kicked at
-    once. The kick of a molecule is added to the pending kicks."""
-    raise TypeError("compiled code only")
-
-
-def drift(model, code, state, load, pending, h):
-    """The pending kicks, then the flow of the kinetic energy, in place: free flight and free rotation."""
-    raise TypeError("compiled code only")
-
-
-@chosen_by_type
-def remove_momentum_flow(model, state):
+@task()
+def _remove_momentum(arguments, block):
     """Remove the conserved components of the total momentum, in place: the same velocity from all molecules. The energy
     that this removes is entered in the energy ledger."""
-    if not is_a(model, Model):
-        return lambda model, state: None
-
-    def remove_momentum_of_molecules(model, state):
-        mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
-        for m in range(len(state.velocity)):
-            m_i = model.mass[model.species[m]]
-            mass += m_i
-            px += m_i * state.velocity[m, 0]
-            py += m_i * state.velocity[m, 1]
-            pz += m_i * state.velocity[m, 2]
-        kept = model.keeps_momentum
-        px, py, pz = kept[0] * px, kept[1] * py, kept[2] * pz
-        for m in range(len(state.velocity)):
-            state.velocity[m, 0] -= px / mass
-            state.velocity[m, 1] -= py / mass
-            state.velocity[m, 2] -= pz / mass
-        state.energy_ledger[REMOVED] -= (px * px + py * py + pz * pz) / (2 * mass)
-
-    return remove_momentum_of_molecules
+    model, state = load_arguments(arguments)
+    mass, px, py, pz = 0.0, 0.0, 0.0, 0.0
+    for m in range(len(state.velocity)):
+        m_i = model.mass[model.species[m]]
+        mass += m_i
+        px += m_i * state.velocity[m, 0]
+        py += m_i * state.velocity[m, 1]
+        pz += m_i * state.velocity[m, 2]
+    kept = model.keeps_momentum
+    px, py, pz = kept[0] * px, kept[1] * py, kept[2] * pz
+    for m in range(len(state.velocity)):
+        state.velocity[m, 0] -= px / mass
+        state.velocity[m, 1] -= py / mass
+        state.velocity[m, 2] -= pz / mass
+    state.energy_ledger[REMOVED] -= (px * px + py * py + pz * pz) / (2 * mass)
 
 
-@implements(kick, Model)
-def _kick_molecules(model, code, state, load, pending, h):
+@kernel
+def kick(model, code, state, load, pending, h):
+    """Exact flow of the potential: V += h F/m, L += h n_body, added to the pending kicks. Returns these."""
     if pending[0] == 0.0:
         return h, 0.0
     if pending[1] == 0.0:
@@ -272,23 +332,12 @@ def _kick_molecules(model, code, state, load, pending, h):
     return h, 0.0
 
 
-@implements(drift, Model)
-def _drift_molecules(model, code, state, load, pending, h):
-    _move_all(model, code, state, load, pending, h, True)
-
-
-@chosen_by_type
+@kernel
 def apply_pending_kicks(model, code, state, load, pending):
     """Do the pending kicks, in place. Returns NO_PENDING_KICKS."""
-    if not is_a(model, Model):
-        return lambda model, code, state, load, pending: pending
-
-    def apply_pending_kicks_of_molecules(model, code, state, load, pending):
-        if pending[0] != 0.0:
-            _move_all(model, code, state, load, pending, 0.0, False)
-        return NO_PENDING_KICKS
-
-    return apply_pending_kicks_of_molecules
+    if pending[0] != 0.0:
+        _move_all(model, code, state, load, pending, 0.0, False)
+    return NO_PENDING_KICKS
 
 
 @implements(displace, Model)
@@ -309,20 +358,6 @@ def _add_gyration_of_molecules(model, load, tau, gain):
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
             gain.torque_body[m, k] += tau * (inverse[i] - inverse[j]) * n[i] * n[j]
-
-
-@chosen_by_type
-def accumulate_work(model, terms, state, h):
-    """Add the work of time-dependent terms over h to the energy ledger; half before a kick, half after it. The work on
-    a body is the power of its terms at the present velocity. The work on molecules is the rate at which their potential
-    energy changes at fixed positions."""
-    if not is_a(model, Model):
-        return None
-
-    def accumulate_work_of_molecules(model, terms, state, h):
-        state.energy_ledger[WORK] += h * total_energy_rate(terms)
-
-    return accumulate_work_of_molecules
 
 
 @kernel

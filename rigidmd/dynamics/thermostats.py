@@ -1,4 +1,4 @@
-"""Thermostats: flows on the momenta that keep a temperature, chosen by type; NVE compiles none.
+"""Thermostats: flows on the momenta that keep a temperature, each a pass of the step; NVE has none.
 
 `apply_thermostat` acts where a scheme has the flow THERMOSTAT. The heat that a thermostat adds is summed in
 `state.energy_ledger[HEAT]`, its own variables are in `state.extra_variables`. Its random numbers are counted by the
@@ -12,11 +12,21 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidmd.compile import (
-    MOST_BLOCKS, call_blocks, chosen_by_type, implements, is_a, kernel, load_arguments, pack_arguments, task,
-)  # fmt: skip
+    MOST_BLOCKS,
+    Code,
+    Pass,
+    call_blocks,
+    chosen_by_type,
+    implements,
+    kernel,
+    load_arguments,
+    pack_arguments,
+    task,
+)
 from rigidmd.compile.simd import align_stack
-from rigidmd.core.state import EXAMPLE, HEAT, NOW, ORIGIN
+from rigidmd.core.state import EXAMPLE, HEAT, NOW, ORIGIN, State
 from rigidmd.dynamics.noise import BATCH, Key, chi_square, fill_normals, normals, uniforms
+from rigidmd.dynamics.registers import Registers
 from rigidmd.forces.neighbors.sites import blocks_of, molecules_of_block
 from rigidmd.mechanics.batches import LANES, apply_langevin_group, kinetic_energies, scale_group
 
@@ -37,10 +47,6 @@ def constant_ramp(value: float) -> Ramp:
 def ramp_value(ramp, state):
     """The value of a ramp in the present step."""
     return ramp.first + (ramp.last - ramp.first) * ((state.step[NOW] - state.step[ORIGIN] + 1) / ramp.steps)
-
-
-class NoThermostat(NamedTuple):
-    rate: float = 0.0
 
 
 class VelocityRescaling(NamedTuple):
@@ -122,8 +128,8 @@ def thermostat_workspace() -> np.ndarray:
     return np.zeros((MOST_BLOCKS, 2))
 
 
-def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> dict[str, tuple]:
-    """The tasks of a thermostat that act on blocks of molecules, see `compile.Code`; empty if it has none."""
+def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> Code:
+    """The tasks of a thermostat that act on blocks of molecules."""
     state, workspace = EXAMPLE[0], thermostat_workspace()
     found: dict[str, tuple] = {}
     if isinstance(thermostat, Langevin | Andersen | HybridMonteCarlo):
@@ -133,15 +139,27 @@ def thermostat_code(thermostat: NamedTuple, model: NamedTuple) -> dict[str, tupl
         found["kinetic_energies"] = _compute_kinetic_energies, (model, state, workspace)
     if isinstance(thermostat, VelocityRescaling | NoseHoover):
         found["scale"] = _scale, (state, 0.0, 0.0)
-    return found
+    return Code(**found)
 
 
 @chosen_by_type
 def apply_thermostat(thermostat, model, code, state, workspace, h, draw):
     """The flow of a thermostat over a time h (ps), in place. draw : its first random draw in this step. workspace : see
     `thermostat_workspace`"""
-    if is_a(thermostat, NoThermostat):
-        return lambda thermostat, model, code, state, workspace, h, draw: None
+    return None
+
+
+@task()
+def _apply_thermostat(arguments, block):
+    thermostat, model, code, state, workspace, registers = load_arguments(arguments)
+    apply_thermostat(thermostat, model, code, state, workspace, registers.h[0], registers.draw[0])
+
+
+def thermostat_pass(
+    thermostat: NamedTuple, model: NamedTuple, code: Code, state: State, workspace: np.ndarray, registers: Registers
+) -> Pass:
+    """`apply_thermostat` over the time in the registers. code : with `thermostat_code`"""
+    return Pass("thermostat", _apply_thermostat, (thermostat, model, code, state, workspace, registers))
 
 
 @implements(apply_thermostat, VelocityRescaling)

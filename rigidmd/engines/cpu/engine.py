@@ -18,14 +18,15 @@ from rigidmd.core.state import (
     BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State,
     no_load,
 )  # fmt: skip
-from rigidmd.dynamics.barostats import BarostatWorkspace, NoBarostat, barostat_workspace
-from rigidmd.dynamics.body_step_loop import Body
+from rigidmd.dynamics.barostats import BarostatWorkspace, barostat_workspace
+from rigidmd.dynamics.body_step_loop import Body, advance_body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
 from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_workspace
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
-from rigidmd.dynamics.step_loop import Advance, advance_body, flow_arrays, molecule_code
-from rigidmd.dynamics.thermostats import NoThermostat, thermostat_workspace
+from rigidmd.dynamics.registers import LOADED
+from rigidmd.dynamics.step_loop import Advance, CouplingWorkspaces, FlowArrays, flow_arrays
+from rigidmd.dynamics.thermostats import thermostat_workspace
 from rigidmd.engines.protocol import Engine, NotFiniteError, Tally, keep_time
 from rigidmd.errors import SimulationError
 from rigidmd.forces.fields.walls import LennardJonesWalls
@@ -88,7 +89,6 @@ class CpuEngine(Engine):
         self._python_forces = python_forces or {}
         self.threads = threads
         self._workspaces: tuple[NamedTuple, ...] | None = None
-        self._codes: dict = {}
         self.load: Load | None = None
         self._probe: GradientWorkspace | None = None
         self._heat = thermostat_workspace()
@@ -101,7 +101,7 @@ class CpuEngine(Engine):
         self._moved: State | None = None
         self._observed_load: Load | None = None  # returned by the last `evaluate_current`
         self._advance: tuple[tuple, Advance] | None = None  # with the objects that it is bound to
-        self._bound_flows: tuple[Scheme, tuple] | None = None
+        self._bound_flows: tuple[Scheme, FlowArrays] | None = None
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
@@ -136,17 +136,18 @@ class CpuEngine(Engine):
 
     def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
+        model = self.model_for(integrator)
+
+        def new_advance(dispatcher: TermDispatcher) -> Advance:
+            couplings, gradient = self._coupling_workspaces(integrator, state), self._gradient(integrator, state)
+            return Advance(integrator, model, state, load, dispatcher.table, couplings, gradient)
+
         if "steps" not in self._dispatchers:
-            model, thermostat = self.model_for(integrator), integrator.thermostat or NoThermostat()
-            self._compile(lambda: (self._new_dispatcher("steps", workspaces), molecule_code(model, thermostat)))
+            self._compile(lambda: new_advance(self._new_dispatcher("steps", workspaces)))
         dispatcher = self._dispatcher("steps", workspaces)
         bound_to = (self.model, integrator, state, load, dispatcher)
         if self._advance is None or any(now is not then for now, then in zip(bound_to, self._advance[0], strict=True)):
-            model, rest = self.model_for(integrator), self._flow_arguments(integrator, state)
-            kind = (type(model.rotor), type(rest[0]))
-            if kind not in self._codes:
-                self._codes[kind] = molecule_code(model, rest[0])
-            self._advance = bound_to, Advance(model, self._codes[kind], state, load, dispatcher.table, *rest)
+            self._advance = bound_to, new_advance(dispatcher)
         advance = self._advance[1]
         advance.begin(*step, not self._stale)
         other = self._probe and self._probe.load
@@ -158,26 +159,31 @@ class CpuEngine(Engine):
     def _move_body(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance a body. Returns whether the load belongs to the new position."""
         if self._bound_flows is None or self._bound_flows[0] is not integrator:
-            self._bound_flows = integrator, self._flow_arguments(integrator, state)
-        model, rest = self.model_for(integrator), self._bound_flows[1]
-        cursor = np.array([0, not self._stale, 0], np.int64)
-        while status := advance_body(model, None, state, load, workspaces, *rest, *step, cursor):
+            self._bound_flows = integrator, flow_arrays(integrator)
+        model, flows, gradient = self.model_for(integrator), self._bound_flows[1], self._gradient(integrator, state)
+        progress = np.array([0, not self._stale, 0], np.int64)
+        dt, until, _ = step
+        while status := advance_body(model, state, load, workspaces, flows, gradient, dt, until, progress):
             workspaces = self._handle_status(status, state)
-        return cursor[1] != 0  # also False after no step, because then no forces were evaluated
+        return progress[LOADED] != 0  # also False after no step, because then no forces were evaluated
 
-    def _flow_arguments(self, integrator: Scheme, state: State) -> tuple:
-        """The arguments of the compiled step loop that depend on the integrator."""
-        probe = box = trajectory = None
-        if integrator.has_gradient:
-            probe = self._probe = self._probe or gradient_workspace(state)
+    def _gradient(self, integrator: Scheme, state: State) -> GradientWorkspace | None:
+        """The arrays for kicks with gradients, if the integrator has any."""
+        if not integrator.has_gradient:
+            return None
+        self._probe = self._probe or gradient_workspace(state)
+        return self._probe
+
+    def _coupling_workspaces(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
+        """What thermostat, barostat and trajectories of an integrator remember."""
+        box = trajectory = None
         if integrator.barostat is not None:
             box = self._box_workspace = self._box_workspace or barostat_workspace(state)
         if integrator.trajectory_steps:
             trajectory = self._trajectory = self._trajectory or trajectory_workspace(state)
         elif self._trajectory is not None:
             self._trajectory.known[0] = 0  # another integrator moves the state
-        flows = integrator.thermostat or NoThermostat(), integrator.barostat or NoBarostat(), flow_arrays(integrator)
-        return *flows, probe, self._heat, box, trajectory
+        return CouplingWorkspaces(self._heat, box, trajectory)
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
