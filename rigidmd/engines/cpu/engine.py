@@ -6,7 +6,7 @@ returns that one is full, and raises exceptions for status codes.
 
 # isort: skip_file
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -136,7 +136,7 @@ class CpuEngine(Engine):
 
     def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
-        model = self.model_for(integrator)
+        model = cast(Model, self.model_for(integrator))
 
         def new_advance(dispatcher: TermDispatcher) -> Advance:
             couplings, gradient = self._coupling_workspaces(integrator, state), self._gradient(integrator, state)
