@@ -224,6 +224,14 @@ class Simulation(Displayed):
         """The present state of molecules as an `ase.Atoms`, exactly: see `Results.atoms`. Observers may call it."""
         return self._molecules(begun=True).atoms()
 
+    def compile(self) -> None:
+        """Compile what a run needs, or read it from the cache, without running: before a course, or on a login node.
+
+        A stage with integrator = "auto" compiles more when pilot runs have chosen.
+        """
+        self._before_run().prepare()
+        self.part.reset()
+
     def take_threads(self, count: int) -> None:
         """Set the number of threads. Results do not depend on it; a single body always has one."""
         self._before_run().take_threads(count)
