@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import SCHEMES, built, integrator_of_stage, small_scene
+from support import SCHEMES, built, integrator_of_stage, small_scene, write_scene
 
 from rigidmd.commands.cli import main
 from rigidmd.compile import ALWAYS, Pass, Program, kernel, load_arguments, run_passes, task
@@ -94,7 +94,7 @@ def test_the_step_loop_is_compiled_once_for_all_thermostats_barostats_and_forces
 
 
 def test_a_stage_without_a_thermostat_has_no_flow_of_one():
-    system, engine, state = built({"argon": 5}, 14.0, stages=[STAGE, {"ensemble": "nve", "duration_ps": 0.01}])
+    system, engine, state = built({"argon": 5}, 20.0, stages=[STAGE, {"ensemble": "nve", "duration_ps": 0.01}])
     texts = [[row.text for row in program_of(engine, state, integrator_of_stage(system, k))] for k in (0, 1)]
     assert any("thermostat VelocityRescaling" in text for text in texts[0])
     assert not any("thermostat" in text for text in texts[1])
@@ -126,6 +126,19 @@ def test_check_prints_the_program_of_each_stage(tmp_path, capsys, monkeypatch):
     assert "--program is for molecules" in capsys.readouterr().err
 
 
+def test_check_measures_the_rows_of_a_step(tmp_path, capsys):
+    scene = small_scene({"spce": 30, "argon": 5}, 14.0, forces={"cutoff_A": 5.0}, stages=[STAGE | {"timestep_fs": 0.5}])
+    write_scene(tmp_path, scene)
+    assert main(["check", str(tmp_path / "scene.toml"), "--profile"]) == 0
+    lines = capsys.readouterr().out.partition("time of a step of stages.0")[2].splitlines()
+    rows = {line.rpartition("  ")[0].strip(): line.split()[-2:] for line in lines[1:]}
+    assert any("forces of pairs" in name for name in rows)
+    assert not any("energies" in name for name in rows)
+    times = [float(line.split()[-2]) for line in lines[2:] if line.endswith("%")]
+    assert len(times) > 5
+    assert all(spent >= 0 for spent in times)
+
+
 def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "heavy_top_1"]) == 0
@@ -134,8 +147,8 @@ def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):
         assert main(["compile", "heavy_top_1.toml"]) == 0
         assert expected in capsys.readouterr().out
     assert not (tmp_path / "runs").exists()
-    simulation = Simulation(small_scene({"argon": 5}, 14.0, stages=[STAGE]), warn=str)
+    simulation = Simulation(small_scene({"argon": 5}, 20.0, stages=[STAGE]), warn=str)
     before = simulation.state.copy()
     simulation.compile()
     assert all(np.array_equal(one, other) for one, other in zip(simulation.state, before, strict=True))
-    assert simulation.run().summary["steps"] > 0
+    assert simulation.run().state.step[0] == 2

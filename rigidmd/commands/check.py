@@ -11,6 +11,8 @@ from rigidmd.errors import SceneError
     70, "describe a run without running it", "rigidmd check water_nitrogen.toml", *SCENE, add_engine,
     argument("--program", action="store_true",
         help="also print the rows of a step: what is done, in which order, on how many blocks"),
+    argument("--profile", action="store_true",
+        help="also measure how much of the time of a step each row of the forces takes, from the start"),
 )  # fmt: skip
 def _check(options: Options) -> int:
     from rigidmd.assemble.describe import describe_system
@@ -21,8 +23,9 @@ def _check(options: Options) -> int:
         from rigidmd.assemble.body import build_body
         from rigidmd.run.pilot.stable_step import body_step_warnings
 
-        if options.program:
-            raise SceneError(scene.source, ["--program is for molecules; the step of a body is one loop"])
+        if options.program or options.profile:
+            option = "--program" if options.program else "--profile"
+            raise SceneError(scene.source, [f"{option} is for molecules; the step of a body is one loop"])
         body = build_body(scene)
         print(describe_system(body))
         warnings = [*body.warnings, *body_step_warnings(body)]
@@ -37,6 +40,8 @@ def _check(options: Options) -> int:
             print(check_engine(system))
         if options.program:
             _print_programs(system)
+        if options.profile:
+            _print_profile(scene)
         warnings = [*system.warnings, *step_warnings(scene)]
     for warning in warnings:
         warn(warning)
@@ -55,3 +60,23 @@ def _print_programs(system: Any) -> None:
         scheme = integrator_of_stage(system, k)
         print(f"\nprogram of a step of stages.{k} ({stage.label}, {scheme.name}):")
         print(describe_program(program_of(engine, system.state, scheme)))
+
+
+def _print_profile(scene: Any) -> None:
+    """Measure and print the rows of the first stage in which time passes."""
+    from rigidmd.assemble.build import integrator_of_stage
+    from rigidmd.engines.cpu.program import describe_profile, profile_of
+    from rigidmd.run import Simulation
+    from rigidmd.units import FEMTOSECOND
+
+    stages = [k for k, stage in enumerate(scene.stages) if not stage.is_minimisation and not stage.is_auto]
+    if not stages or scene.forces.custom:
+        problem = "--profile needs a stage with a time step, and forces that are not user-defined"
+        raise SceneError(scene.source, [problem])
+    simulation = Simulation(scene)
+    state = simulation.settle()
+    system, stage = simulation.system, scene.stages[stages[0]]
+    scheme = integrator_of_stage(system, stages[0])
+    profile = profile_of(system.engine(), state, scheme, stage.timestep_fs * FEMTOSECOND)
+    print(f"\ntime of a step of stages.{stages[0]} ({stage.label}) and of its rows, {simulation.threads} threads:")
+    print(describe_profile(profile))

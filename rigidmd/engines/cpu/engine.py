@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
-from rigidmd.compile import Pass, compile_together, set_threads
+from rigidmd.compile import Pass, Rows, compile_together, set_threads
 from rigidmd.compile.kernels import CompileError
 from rigidmd.compile.machine import usable_threads
 from rigidmd.core.integrators import Scheme, Solver
@@ -311,6 +311,10 @@ class CpuEngine(Engine):
     @property
     def trajectories(self) -> np.ndarray | None:
         return None if self._trajectory is None else self._trajectory.sums.copy()
+
+    def rows_of_steps(self) -> Rows:
+        """The rows of the forces of steps, bound to the state that `advance` has moved last."""
+        return self._dispatchers["steps"].table.rows
 
     def passes(self, state: State) -> dict[str, list[Pass]]:
         """Name of a term -> its passes at a state, in their order. Nothing is compiled."""

@@ -1,7 +1,10 @@
 """The program of a stage in words: what is done in a step, in which order, on how many blocks."""
 
+import time
+from statistics import median
 from typing import NamedTuple
 
+from rigidmd.compile import run_single_row
 from rigidmd.core.integrators import (
     BAROSTAT,
     BEGIN_TRAJECTORY,
@@ -61,6 +64,53 @@ def program_of(engine: CpuEngine, state: State, scheme: Scheme) -> list[Row]:
     if positions_are_new:
         rows += [Row("forces, with the next step", 1, EVERY_STEP), *forces]
     return rows
+
+
+#: Steps before a profile, and steps that it measures.
+SETTLING, MEASURED = 20, 50
+
+
+class Profile(NamedTuple):
+    """Median times of a step and its rows, without energies."""
+
+    step: float  # s
+    rows: list[tuple[str, float]]  # text and s of each row of the forces; the last one is the rest of the step
+
+
+def profile_of(engine: CpuEngine, state: State, scheme: Scheme, dt: float) -> Profile:
+    """Measure the rows of the forces over some steps from a state, which is copied. dt in ps.
+
+    Each row is timed by itself, after steps that move the molecules, so that the list is updated as in a run.
+    Raises SimulationError.
+    """
+    state = engine.begin(state, scheme)
+    engine.advance(state, scheme, dt, SETTLING)
+    rows = engine.rows_of_steps()
+    texts = [f"{name}: {one.text}" for name, passes in engine.passes(state).items() for one in passes]
+    used = [k for k, when in enumerate(rows.when) if when & FORCES_ONLY]
+    times: dict[int, list[float]] = {k: [] for k in used}
+    steps: list[float] = []
+    for n in range(MEASURED):
+        began = time.perf_counter()
+        engine.advance(state, scheme, dt, SETTLING + n + 1)
+        steps.append(time.perf_counter() - began)
+        for load in engine.load or ():
+            load[:] = 0.0
+        for k in used:
+            began = time.perf_counter()
+            run_single_row(rows, k)
+            times[k].append(time.perf_counter() - began)
+    step = median(steps)
+    found = [(texts[k], median(spent)) for k, spent in times.items()]
+    rest = step - scheme.force_evaluations * sum(spent for _, spent in found)
+    return Profile(step, [*found, ("kicks, drifts, and all else", max(0.0, rest))])
+
+
+def describe_profile(profile: Profile) -> str:
+    """A table of the rows of a profile, with their fractions of a step."""
+    width = max(len(text) for text, _ in profile.rows)
+    lines = [f"  {text:<{width}} {1e6 * spent:>9.1f} {spent / profile.step:>6.1%}" for text, spent in profile.rows]
+    return "\n".join([f"  {'a step':<{width}} {1e6 * profile.step:>9.1f} µs", *lines])
 
 
 def _when(bits: int) -> str:
