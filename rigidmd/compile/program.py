@@ -87,12 +87,6 @@ def run_row(rows, k):
     return rows.status[0]
 
 
-@kernel(from_python=True)
-def run_single_row(rows, k):
-    """`run_row` for Python, which measures the time of a pass."""
-    return run_row(rows, k)
-
-
 @kernel
 def run_passes(rows, arguments, when):
     """Call the passes that act at `when`, bits; returns the first status that is not 0, or 0. arguments : their

@@ -231,6 +231,7 @@ class Advance:
         self, scheme: Scheme, model: Model, state: State, load: Load, terms: TermTable,
         workspaces: CouplingWorkspaces, gradient: GradientWorkspace | None,
     ):  # fmt: skip
+        self.gradient = gradient
         self._registers = registers = registers_of(workspaces)
         status = np.zeros(1, np.int64)
         passes = coupling_passes(scheme, model, terms, state, load, workspaces, registers, status)

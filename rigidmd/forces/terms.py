@@ -26,7 +26,7 @@ from rigidmd.compile import (
     run_passes,
     task,
 )
-from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State
+from rigidmd.core.state import EXAMPLE, OK, TALLY_SIZE, Load, State, no_load
 
 
 class Setup(NamedTuple):
@@ -185,6 +185,13 @@ class TermDispatcher:
         elsewhere = np.zeros_like(rows.arguments)
         self.table = TermTable(rows, elsewhere, self._rates.rows, self._tallies, valid, self._power)
         self._bound_to: tuple = ()
+        self._load: Load | None = None
+
+    def load_for(self, state: State) -> Load:
+        """An array for the forces on the bodies of a state, which the next call may return again."""
+        if self._load is None or len(self._load.force) != len(state.velocity):
+            self._load = no_load(state)
+        return self._load
 
     def _passes(self, workspaces: tuple[NamedTuple, ...], state: State, load: Load) -> list[Pass]:
         found: list[Pass] = []

@@ -6,7 +6,8 @@ returns that one is full, and raises exceptions for status codes.
 
 # isort: skip_file
 from collections.abc import Callable
-from typing import Literal, NamedTuple, cast
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -18,10 +19,10 @@ from rigidmd.core.state import (
     BEHIND_WALL, CELL_CHANGED, EXAMPLE, LIST_FULL, NEEDS_PYTHON_FORCES, NOT_FINITE, NOW, TALLY_SIZE, Load, State,
     no_load,
 )  # fmt: skip
-from rigidmd.dynamics.barostats import BarostatWorkspace, barostat_workspace
+from rigidmd.dynamics.barostats import barostat_workspace
 from rigidmd.dynamics.body_step_loop import Body, advance_body
 from rigidmd.dynamics.force_gradient import GradientWorkspace, gradient_workspace
-from rigidmd.dynamics.hybrid_monte_carlo import TrajectoryWorkspace, trajectory_workspace
+from rigidmd.dynamics.hybrid_monte_carlo import trajectory_workspace
 from rigidmd.dynamics.model import Model
 from rigidmd.dynamics.observables import LargestValues, StateSums
 from rigidmd.dynamics.registers import LOADED
@@ -66,6 +67,20 @@ DTYPES = {"double": np.float64, "mixed": np.float32}
 ROUNDING = {np.float64: 1e-8, np.float32: 1e-3}
 
 
+@dataclass
+class LastAdvance:
+    """What the last call of `CpuEngine.advance` has left.
+
+    The load, the energies and the sums of the engine belong to `state` alone, and to its positions only while
+    `is_current`: until the forces are asked for after `forget`, `change` or `recall`, or the last steps ended without
+    forces.
+    """
+
+    state: State | None = None
+    is_current: bool = False
+    observed: Load | None = None  # the copy of the load that `evaluate_current` has returned, to which the sums belong
+
+
 class CpuEngine(Engine):
     """An engine of compiled code.
 
@@ -84,24 +99,22 @@ class CpuEngine(Engine):
         self, model: Model | Body, terms: dict[str, NamedTuple], precision: Precision = "double", skin: float = 1.9,
         python_forces: dict[str, Callable] | None = None, threads: int | None = None, needs_virials: bool = False
     ):  # fmt: skip
-        self.model, self.terms, self.names = model, terms, list(terms)
+        self.model, self.terms = model, terms
         self._setup = Setup(np.zeros((3, 3)), DTYPES[precision], skin, needs_virials)
         self._python_forces = python_forces or {}
         self.threads = threads
-        self._workspaces: tuple[NamedTuple, ...] | None = None
         self.load: Load | None = None
-        self._probe: GradientWorkspace | None = None
-        self._heat = thermostat_workspace()
+        # What terms and couplings remember. The other attributes can be made from these and the state at any time.
+        self._workspaces: tuple[NamedTuple, ...] | None = None
+        self._couplings = CouplingWorkspaces(thermostat_workspace(), None, None)
+        self._last = LastAdvance()
         self._dispatchers: dict[str, TermDispatcher] = {}
-        self._evaluated: Load | None = None
-        self._box_workspace: BarostatWorkspace | None = None
-        self._trajectory: TrajectoryWorkspace | None = None
-        self._stale = True
-        self._checked: State | None = None
-        self._moved: State | None = None
-        self._observed_load: Load | None = None  # returned by the last `evaluate_current`
-        self._advance: tuple[tuple, Advance] | None = None  # with the objects that it is bound to
-        self._bound_flows: tuple[Scheme, FlowArrays] | None = None
+        self._bound: tuple[tuple, Any] | None = None  # the step loop, with the objects that it is bound to
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the terms."""
+        return list(self.terms)
 
     @property
     def workspaces(self) -> dict[str, NamedTuple]:
@@ -114,7 +127,7 @@ class CpuEngine(Engine):
         self.forget()
 
     def forget(self) -> None:
-        self._stale = True
+        self._last.is_current = False
 
     def variables(self, state: State, integrator: Scheme | Solver) -> np.ndarray:
         """The variables of the thermostat and the barostat of a scheme, at rest."""
@@ -125,32 +138,30 @@ class CpuEngine(Engine):
         integrator = _as_scheme(integrator)
         workspaces = self._prepare(state)
         keep_time(state, dt)
-        if state is not self._moved and "steps" in self._dispatchers:  # its energies belong to another state
+        last = self._last
+        if state is not last.state and "steps" in self._dispatchers:  # its energies belong to another state
             self._dispatchers["steps"].table.tallies_valid[0] = 0
-        self._moved = state
         if self.load is None:
             self.load = no_load(state)
+        last.state, last.observed = state, None
         move = self._move_molecules if isinstance(self.model, Model) else self._move_body
-        self._observed_load = None
-        self._stale = not move(state, self.load, integrator, workspaces, (float(dt), int(until), observed))
+        last.is_current = move(state, self.load, integrator, workspaces, (float(dt), int(until), observed))
 
     def _move_molecules(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance molecules. Returns whether the load belongs to the new positions."""
         model = cast(Model, self.model_for(integrator))
 
         def new_advance(dispatcher: TermDispatcher) -> Advance:
-            couplings, gradient = self._coupling_workspaces(integrator, state), self._gradient(integrator, state)
+            couplings = self._couplings_of(integrator, state)
+            gradient = gradient_workspace(state) if integrator.has_gradient else None
             return Advance(integrator, model, state, load, dispatcher.table, couplings, gradient)
 
         if "steps" not in self._dispatchers:
             self._compile(lambda: new_advance(self._new_dispatcher("steps", workspaces)))
         dispatcher = self._dispatcher("steps", workspaces)
-        bound_to = (self.model, integrator, state, load, dispatcher)
-        if self._advance is None or any(now is not then for now, then in zip(bound_to, self._advance[0], strict=True)):
-            self._advance = bound_to, new_advance(dispatcher)
-        advance = self._advance[1]
-        advance.begin(*step, not self._stale)
-        other = self._probe and self._probe.load
+        advance = self._bind((self.model, integrator, state, load, dispatcher), lambda: new_advance(dispatcher))
+        advance.begin(*step, self._last.is_current)
+        other = advance.gradient and advance.gradient.load
         dispatcher.bind(workspaces, state, load, other)
         while status := advance():
             dispatcher.bind(self._handle_status(status, state), state, load, other)
@@ -158,32 +169,37 @@ class CpuEngine(Engine):
 
     def _move_body(self, state: State, load: Load, integrator: Scheme, workspaces: tuple, step: Steps) -> bool:
         """Advance a body. Returns whether the load belongs to the new position."""
-        if self._bound_flows is None or self._bound_flows[0] is not integrator:
-            self._bound_flows = integrator, flow_arrays(integrator)
-        model, flows, gradient = self.model_for(integrator), self._bound_flows[1], self._gradient(integrator, state)
-        progress = np.array([0, not self._stale, 0], np.int64)
-        dt, until, _ = step
+
+        def flows_and_gradient() -> tuple[FlowArrays, GradientWorkspace | None]:
+            return flow_arrays(integrator), gradient_workspace(state) if integrator.has_gradient else None
+
+        flows, gradient = self._bind((integrator, state), flows_and_gradient)
+        model, (dt, until, _) = self.model_for(integrator), step
+        progress = np.array([0, self._last.is_current, 0], np.int64)
         while status := advance_body(model, state, load, workspaces, flows, gradient, dt, until, progress):
             workspaces = self._handle_status(status, state)
         return progress[LOADED] != 0  # also False after no step, because then no forces were evaluated
 
-    def _gradient(self, integrator: Scheme, state: State) -> GradientWorkspace | None:
-        """The arrays for kicks with gradients, if the integrator has any."""
-        if not integrator.has_gradient:
-            return None
-        self._probe = self._probe or gradient_workspace(state)
-        return self._probe
+    def _bind(self, objects: tuple, make: Callable[[], Any]) -> Any:
+        """What `make` returns, which is kept while it is bound to the same objects."""
+        if self._bound is None or not _are_same(objects, self._bound[0]):
+            self._bound = objects, make()
+        return self._bound[1]
 
-    def _coupling_workspaces(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
-        """What thermostat, barostat and trajectories of an integrator remember."""
-        box = trajectory = None
+    def _couplings_of(self, integrator: Scheme, state: State) -> CouplingWorkspaces:
+        """What thermostat, barostat and trajectories of an integrator remember; made at their first use."""
+        heat, box, trajectory = self._couplings
         if integrator.barostat is not None:
-            box = self._box_workspace = self._box_workspace or barostat_workspace(state)
+            box = box or barostat_workspace(state)
         if integrator.trajectory_steps:
-            trajectory = self._trajectory = self._trajectory or trajectory_workspace(state)
-        elif self._trajectory is not None:
-            self._trajectory.known[0] = 0  # another integrator moves the state
-        return CouplingWorkspaces(self._heat, box, trajectory)
+            trajectory = trajectory or trajectory_workspace(state)
+        elif trajectory is not None:
+            trajectory.known[0] = 0  # another integrator moves the state
+        self._couplings = CouplingWorkspaces(heat, box, trajectory)
+        used = self._couplings
+        if integrator.barostat is None:
+            used = used._replace(box=None)
+        return used if integrator.trajectory_steps else used._replace(trajectory=None)
 
     def _dispatcher(self, use: str, workspaces: tuple[NamedTuple, ...]) -> TermDispatcher:
         if use not in self._dispatchers:
@@ -202,27 +218,28 @@ class CpuEngine(Engine):
 
     def evaluate(self, state: State) -> tuple[Load, dict[str, Tally]]:
         workspaces = self._prepare(state)
-        if self._evaluated is None or len(self._evaluated.force) != len(state.velocity):
-            self._evaluated = no_load(state)
-        load, dispatcher = self._evaluated, self._dispatcher("observations", workspaces)
+        dispatcher = self._dispatcher("observations", workspaces)
+        load = dispatcher.load_for(state)
         while status := compute_load_with_energies(dispatcher.bind(workspaces, state, load), *load):
             workspaces = self._handle_status(status, state)
         return self._copies(load, dispatcher)
 
     def evaluate_current(self, state: State) -> tuple[Load, dict[str, Tally]]:
-        moving, is_current = self._dispatchers.get("steps"), state is self._moved and not self._stale
+        moving, last = self._dispatchers.get("steps"), self._last
+        is_current = state is last.state and last.is_current
         if self.load is None or moving is None or not (is_current and moving.table.tallies_valid[0]):
             return self.evaluate(state)
-        self._observed_load, tallies = self._copies(self.load, moving)
-        return self._observed_load, tallies
+        last.observed, tallies = self._copies(self.load, moving)
+        return last.observed, tallies
 
     def sums(self, state: State, load: Load) -> StateSums | None:
-        return self._advance[1].sums if self._advance is not None and load is self._observed_load else None
+        return self._bound[1].sums if self._bound is not None and load is self._last.observed else None
 
     def extent(self, state: State) -> LargestValues | None:
-        if self._advance is None or self._stale or state is not self._moved:
+        last = self._last
+        if self._bound is None or not last.is_current or state is not last.state:
             return None
-        return self._advance[1].extent
+        return self._bound[1].extent if isinstance(self.model, Model) else None
 
     def _copies(self, load: Load, dispatcher: TermDispatcher) -> tuple[Load, dict[str, Tally]]:
         """A copy of a load, and the tally of each term."""
@@ -234,12 +251,12 @@ class CpuEngine(Engine):
     def memory(self) -> dict[str, np.ndarray] | None:
         """Neighbour lists as last built, forces at the present positions, and the memory of the barostat."""
         owners = {name: checkpoint_arrays(workspace) for name, workspace in self.workspaces.items()}
-        if self.load is not None and not self._stale:
+        if self.load is not None and self._last.is_current:
             owners[LOAD] = self.load._asdict()
-        if self._box_workspace is not None:
-            owners[BOX] = {key: getattr(self._box_workspace, key) for key in BOX_FIELDS}
-        if self._trajectory is not None:
-            owners[TRAJECTORY] = {key: getattr(self._trajectory, key) for key in TRAJECTORY_FIELDS}
+        if (box := self._couplings.box) is not None:
+            owners[BOX] = {key: getattr(box, key) for key in BOX_FIELDS}
+        if (trajectory := self._couplings.trajectory) is not None:
+            owners[TRAJECTORY] = {key: getattr(trajectory, key) for key in TRAJECTORY_FIELDS}
         return {f"{owner}.{key}": array for owner, arrays in owners.items() for key, array in arrays.items()}
 
     def recall(self, state: State, memory: dict[str, np.ndarray]) -> None:
@@ -251,21 +268,23 @@ class CpuEngine(Engine):
         if unknown := kept.keys() - {*self.names, LOAD, BOX, TRAJECTORY}:
             raise ValueError(f"an engine of {', '.join(self.names)} has no memory of {', '.join(sorted(unknown))}")
         self._recall_lists(state, kept)
-        self.load, self._stale = no_load(state), LOAD not in kept
+        self.load, self._last = no_load(state), LastAdvance(is_current=LOAD in kept)
         self._dispatchers.pop("steps", None)  # its energies belong to another state
+        heat, box, trajectory = self._couplings
         if LOAD in kept:
             _copy_into(self.load, kept[LOAD])
         if BOX in kept:
-            self._box_workspace = box = barostat_workspace(state)
+            box = barostat_workspace(state)
             _copy_into(box, kept[BOX])
             if box.known[0] not in (0, 1) or not 0 <= box.counts[1] <= box.counts[0]:
                 raise ValueError("the numbers of tried and accepted moves of the box are invalid")
         if TRAJECTORY in kept:
-            self._trajectory = trajectory_workspace(state)
-            _copy_into(self._trajectory, kept[TRAJECTORY])
-            ended, accepted = self._trajectory.sums[:2]
-            if self._trajectory.known[0] not in (0, 1) or not 0 <= accepted <= ended:
+            trajectory = trajectory_workspace(state)
+            _copy_into(trajectory, kept[TRAJECTORY])
+            ended, accepted = trajectory.sums[:2]
+            if trajectory.known[0] not in (0, 1) or not 0 <= accepted <= ended:
                 raise ValueError("the numbers of ended and accepted trajectories are invalid")
+        self._couplings = CouplingWorkspaces(heat, box, trajectory)
         if LOAD in kept and not self._python_forces:
             self._check_recalled(state, kept)
 
@@ -291,7 +310,7 @@ class CpuEngine(Engine):
         same = all(np.array_equal(array, kept[name][key]) for name, of in lists.items() for key, array in of.items())
         if BOX in kept or TRAJECTORY in kept:
             terms = np.array([[tally.energy, *tally.virial.flat] for tally in tallies.values()])
-            box, trajectory = self._box_workspace, self._trajectory
+            _, box, trajectory = self._couplings
             first = int(self._setup.needs_virials)  # a piston needs no energies
             there = [box.tally[0, first:]] if box is not None and box.known[0] else []
             there += [trajectory.energies[:1]] if trajectory is not None and trajectory.known[0] else []
@@ -306,11 +325,11 @@ class CpuEngine(Engine):
 
     @property
     def moves(self) -> tuple[int, int]:
-        return (0, 0) if (box := self._box_workspace) is None else (int(box.counts[0]), int(box.counts[1]))
+        return (0, 0) if (box := self._couplings.box) is None else (int(box.counts[0]), int(box.counts[1]))
 
     @property
     def trajectories(self) -> np.ndarray | None:
-        return None if self._trajectory is None else self._trajectory.sums.copy()
+        return None if (kept := self._couplings.trajectory) is None else kept.sums.copy()
 
     def rows_of_steps(self) -> Rows:
         """The rows of the forces of steps, bound to the state that `advance` has moved last."""
@@ -330,12 +349,10 @@ class CpuEngine(Engine):
 
     def _prepare(self, state: State) -> tuple[NamedTuple, ...]:
         """Check the arrays of a state for compiled code, and return the workspaces, which the first use makes."""
-        if state is not self._checked:
-            for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
-                if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
-                    kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
-                    raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
-            self._checked = state
+        for name, array, example in zip(State._fields, state, EXAMPLE[0], strict=True):
+            if array.dtype != example.dtype or array.ndim != example.ndim or not array.flags.carray:
+                kind = f"a contiguous, writable array of {example.dtype} in C order with {example.ndim} axes"
+                raise TypeError(f"state.{name} must be {kind} (core.state.state_of makes a state of any arrays)")
         if isinstance(self.model, Model):
             set_threads(usable_threads(self.threads))
         if self._workspaces is None:
@@ -372,6 +389,11 @@ def _as_scheme(integrator: Scheme | Solver) -> Scheme:
     if not isinstance(integrator, Scheme):
         raise TypeError(f"{integrator.name} is a general solver, which only OdeEngine uses")
     return integrator
+
+
+def _are_same(objects: tuple, others: tuple) -> bool:
+    """Whether two tuples have the same objects."""
+    return len(objects) == len(others) and all(one is other for one, other in zip(objects, others, strict=True))
 
 
 def _copy_into(arrays: NamedTuple, kept: dict[str, np.ndarray]) -> None:
