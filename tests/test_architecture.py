@@ -145,7 +145,7 @@ COMPILED = (
     "engines/cpu",
     "engines/ode",
 )
-ASKED_BY_OTHERS = {"rigidmd.compile.machine", "rigidmd.compile.cache"}
+ASKED_BY_OTHERS = {"rigidmd.compile.machine", "rigidmd.compile.cache", "rigidmd.compile.sources"}
 
 
 def test_only_packages_of_kernels_compile():

@@ -3,12 +3,10 @@
 # isort: skip_file
 from typing import NamedTuple
 
-from numba import types
-
-from rigidmd.compile import chosen_by_type, implements, kernel
+from rigidmd.compile import chosen_by_type, implements, is_a, kernel
 from rigidmd.core.integrators import KICK
 from rigidmd.core.state import NOW, OK, ORIGIN, WORK
-from rigidmd.dynamics.force_gradient import add_gyration, displace, evaluate
+from rigidmd.dynamics.force_gradient import GradientWorkspace, add_gyration, displace, evaluate
 from rigidmd.dynamics.registers import DONE, LOADED
 from rigidmd.dynamics.step_loop import ORTHOGONALITY_INTERVAL
 from rigidmd.forces.body.resistance import NoResistance, Resistance, kick_with_resistance
@@ -80,7 +78,7 @@ def advance_body(model, state, load, terms, flows, gradient_workspace, dt, until
 @chosen_by_type
 def _evaluate(model, state, load, terms, flows, gradient_workspace, k, dt, known):
     """The forces before kick k; or, if they are known, the addition of their gradient. A status code."""
-    if isinstance(gradient_workspace, types.NoneType):
+    if not is_a(gradient_workspace, GradientWorkspace):
         return lambda model, state, load, terms, flows, gradient_workspace, k, dt, known: compute_body_load(
             terms, state, load
         )
