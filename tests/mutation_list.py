@@ -222,8 +222,8 @@ RINGS = [
     Mutation(
         "B15", "run: the total momentum is removed with the mass of the first species for all",
         "dynamics/step_loop.py",
-        "            m_i = model.mass[model.species[m]]\n            mass += m_i",
-        "            m_i = model.mass[0]\n            mass += m_i",
+        "        m_i = model.mass[model.species[m]]\n        mass += m_i",
+        "        m_i = model.mass[0]\n        mass += m_i",
         ("test_wiring.py::test_a_mixture_is_brought_to_rest_by_one_velocity_for_all",),
     ),
     Mutation(
@@ -309,8 +309,8 @@ RINGS = [
     Mutation(
         "R-hmc-2", "hybrid Monte Carlo: a barostat takes the virial of a trajectory that was rejected",
         "dynamics/hybrid_monte_carlo.py",
-        "            barostat_workspace.known[0] = 0",
-        "            barostat_workspace.known[0] = 1",
+        "        registers.known[0] = 0",
+        "        registers.known[0] = 1",
         ("test_hybrid_monte_carlo.py::test_energy_less_heat_and_work_is_conserved[pressed1]",),
     ),
     Mutation(

@@ -525,7 +525,8 @@ def test_an_override_with_nothing_removes_the_key(tmp_path):
     assert read("forces=").forces.skin_A == 1.9
     assert [stage.timestep_fs for stage in read("stages.0=").stages] == [4]
     assert read("stages.1.timestep_fs=").stages[1].timestep_fs == 2.0
-    assert read('stages.0.name=""').stages[0].name == ""  # an empty text is a value
+    with pytest.raises(SceneError, match=r"stages.0.name: is ''"):  # an empty text is a value, here a wrong one
+        read('stages.0.name=""')
     path.write_text(path.read_text().replace("timestep_fs = 4", "timestep_fs = -4"))
     with pytest.raises(SceneError, match=r"scene.toml: stages.0.timestep_fs: is -4, must be greater than 0"):
         read("stages.0=")  # line 10, where stages.0 has its step, is another stage's

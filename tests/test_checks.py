@@ -232,7 +232,8 @@ def test_ordinary_and_hot_runs_go_on(counts, edge, kelvin, stage):
     warnings = []
     scene = small_scene(counts, edge, start={"temperature_K": kelvin}, stages=[stage])
     results = Simulation(scene, warn=warnings.append).run()
-    assert not warnings
+    # 8 fs is too long for accurate forces on water, and not too long to go on
+    assert ["is inaccurate for spce" in text for text in warnings] == [True] * (stage["timestep_fs"] == 8.0)
     assert results.summary["stages"][0]["steps"] == 500
 
 

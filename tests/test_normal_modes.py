@@ -122,7 +122,7 @@ def test_forces_that_jump_at_the_minimum_are_refused():
     basis = a / 2 * np.array([[0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0]])
     state = state_of((corners[:, None] + basis).reshape(-1, 3), cell=3 * a * np.eye(3))
     scene = small_scene({"argon": 108}, 3 * a, forces={"cutoff_A": a * np.sqrt(2) * (1 + 1e-8), "truncation": "shift"})
-    with pytest.raises(SimulationError, match=r"forces are not smooth.*truncation=smooth_switch"):
+    with pytest.raises(SimulationError, match=r"forces are not smooth.*truncation = 'smooth_switch'"):
         modes_from(scene, state, minimise=False)
 
 

@@ -151,4 +151,4 @@ def test_a_scene_is_compiled_without_running_it(tmp_path, capsys, monkeypatch):
     before = simulation.state.copy()
     simulation.compile()
     assert all(np.array_equal(one, other) for one, other in zip(simulation.state, before, strict=True))
-    assert simulation.run().state.step[0] == 2
+    assert simulation.run().state.step[0] == 1
