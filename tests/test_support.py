@@ -24,6 +24,13 @@ DIRECT = "a test imports what it tests from its module"
 PAST = {
     "support.py": (["rigidmd"], "is the door"),
     "test_compile.py": (["rigidmd.compile", "rigidmd.forces.terms"], OPEN),
+    "test_program.py": (
+        ["rigidmd.compile", "rigidmd.dynamics.step_loop", "rigidmd.engines.cpu.program", "rigidmd.forces.neighbors"],
+        OPEN,
+    ),
+    "test_sources.py": (["rigidmd.compile.sources", "rigidmd.forces"], OPEN),
+    "test_minimise.py": (["rigidmd.run.minimise"], "a module of which it changes a class"),
+    "peer_engines.py": (["rigidmd.compile.sources"], "the folder of the sources that it measures"),
     "test_simd.py": (["rigidmd.compile"], OPEN),
     "test_threads.py": (["rigidmd.compile"], OPEN),
     "test_checks.py": (["rigidmd.compile"], "a script of a user who compiles a function"),

@@ -11,6 +11,7 @@ from support import (
     ORIGIN,
     REMOVE_MOMENTUM,
     REMOVED,
+    BoundTask,
     advance,
     barostat_of,
     boxes,
@@ -247,11 +248,6 @@ def test_a_change_of_the_volume_is_accepted_by_the_power_of_the_number_of_molecu
 # momentum
 
 
-@numba.njit
-def _rest(model, state):
-    advance.remove_momentum_flow(model, state)
-
-
 def pushed(system, seed=1):
     """Thermal momenta of a mixture, and a push along each axis."""
     rng, state = np.random.default_rng(seed), system.state.copy()
@@ -269,7 +265,7 @@ def test_a_mixture_is_brought_to_rest_by_one_velocity_for_all(counts):
     before = state.velocity.copy()
     momentum = mass @ before
     kept = np.array([not field, True, True])
-    _rest(system.model, state)
+    BoundTask(advance._remove_momentum, (system.model, state))()
     assert (mass @ state.velocity)[kept] == pytest.approx(np.zeros(kept.sum()), abs=1e-12)
     assert before - state.velocity == pytest.approx(np.tile(kept * momentum / mass.sum(), (len(mass), 1)))
     energies = [0.5 * mass @ (v**2).sum(axis=1) for v in (before, state.velocity)]

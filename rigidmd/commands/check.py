@@ -49,7 +49,7 @@ def _check(options: Options) -> int:
 
 
 def _print_programs(system: Any) -> None:
-    """Print the program of each stage in which time passes."""
+    """Print the program of each stage that is not a minimisation."""
     from rigidmd.assemble.build import integrator_of_stage
     from rigidmd.engines.cpu.program import describe_program, program_of
 
@@ -63,7 +63,7 @@ def _print_programs(system: Any) -> None:
 
 
 def _print_profile(scene: Any) -> None:
-    """Measure and print the rows of the first stage in which time passes."""
+    """Measure and print the rows of the first stage that is not a minimisation."""
     from rigidmd.assemble.build import integrator_of_stage
     from rigidmd.engines.cpu.program import describe_profile, profile_of
     from rigidmd.run import Simulation

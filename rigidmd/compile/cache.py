@@ -217,8 +217,8 @@ class UnreadableError(Exception):
 class CacheIndex(IndexDataCacheFile):
     """Index of a cache: compiled functions by the types of their arguments.
 
-    Each index belongs to the definitions that its function reaches, those of the classes in the types of its arguments
-    included, so that an index can be read where these classes are. Code for types of modules from outside of the
+    Each index belongs to the definitions that its function reaches, with the classes in the types of its arguments, so
+    that an index can be read where these classes are. Code for types of modules from outside of the
     package is stored only if the name of the module follows from its source (`core.user_modules`). Changes of other
     modules are not noticed, so that old code would run. An index that this process cannot read is not replaced: other
     processes may be able to read it.

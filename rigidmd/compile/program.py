@@ -1,7 +1,7 @@
 """Programs: tables of passes, which one runner executes.
 
-A pass is the address of a task, the address of its arguments, the number of its blocks, and a set of bits that say when
-it acts. Python makes the table from what a scene has. The runner is compiled once for everything: it calls row after
+A pass is the address of a task, the address of its arguments, the number of its blocks, and bits for when it
+acts. Python makes the table from what a scene has. The runner is compiled once for everything: it calls row after
 row, and stops where a pass sets a status. The types of the arguments choose the code of a pass, and nothing above it.
 """
 

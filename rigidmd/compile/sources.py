@@ -107,14 +107,14 @@ def _digest(module: str, name: str) -> str:
 def _references(node: Node) -> tuple[Node, ...]:
     """The definitions of the package that a definition names."""
     module, name = node
-    if module not in _own_modules():
+    if module not in _package_modules():
         return tuple(_references_of_values(module))
     source = source_of(module)
     if name not in source.definitions:
         return ()
-    own = [(module, "")] if name and "" in source.definitions else []
+    loose = [(module, "")] if name and "" in source.definitions else []
     named = [_resolved(module, one) for one in source.definitions[name].names]
-    return tuple(dict.fromkeys([*own, *(one for nodes in named for one in nodes)]))
+    return tuple(dict.fromkeys([*loose, *(one for nodes in named for one in nodes)]))
 
 
 def _resolved(module: str, name: str) -> list[Node]:
@@ -126,9 +126,9 @@ def _resolved(module: str, name: str) -> list[Node]:
     if first not in source.imports:
         return []
     target, item = source.imports[first]
-    if item and f"{target}.{item}" in _own_modules():
+    if item and f"{target}.{item}" in _package_modules():
         target, item = f"{target}.{item}", ""
-    if target not in _own_modules() or f"{target}.".startswith(f"{COMPILER}."):
+    if target not in _package_modules() or f"{target}.".startswith(f"{COMPILER}."):
         return []
     if item:
         return _resolved(target, item)
@@ -142,14 +142,14 @@ def _references_of_values(module: str) -> Iterator[Node]:
     for value in list(vars(sys.modules.get(module, ModuleType(module))).values()):
         value = getattr(value, "py_func", value)
         origin = getattr(value, "__module__", None)
-        if isinstance(value, ModuleType) and value.__name__ in _own_modules():
+        if isinstance(value, ModuleType) and value.__name__ in _package_modules():
             yield from ((value.__name__, name) for name in source_of(value.__name__).definitions)
-        elif isinstance(origin, str) and origin in _own_modules() and hasattr(value, "__qualname__"):
+        elif isinstance(origin, str) and origin in _package_modules() and hasattr(value, "__qualname__"):
             yield node_of(value)
 
 
 @cache
-def _own_modules() -> frozenset[str]:
+def _package_modules() -> frozenset[str]:
     """Names of all modules of the package."""
     paths = (path.relative_to(PACKAGE.parent).with_suffix("") for path in PACKAGE.rglob("*.py"))
     return frozenset(".".join(path.parts).removesuffix(".__init__") for path in paths)
@@ -165,7 +165,7 @@ _stored: dict[str, list] = {}
 @cache
 def source_of(module: str) -> Source:
     """The definitions of a module of the package; none of another one."""
-    if module not in _own_modules():
+    if module not in _package_modules():
         return Source({}, {})
     path = PACKAGE.parent / Path(*module.split("."))
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")

@@ -235,7 +235,7 @@ SEARCH_INTERVAL = 100
 def precision_of_minimisation(system: System, stage: Stage) -> Precision:
     """The precision of the scene where the limits of a stage are far above the error of its forces, else double.
 
-    Forces are as strong as those of the deepest well and of the largest charges at one diameter. A pressure is the
+    The scale of forces is given by the deepest well and by the largest charges at one diameter. A pressure is the
     small difference of large parts, so that a cell relaxes in double precision.
     """
     if stage.changes_box:
