@@ -74,9 +74,8 @@ class Rigidmd:
     @staticmethod
     def version() -> str:
         import rigidmd
-        from rigidmd.compile.sources import PACKAGE
 
-        paths = sorted(PACKAGE.rglob("*.py"))
+        paths = sorted(Path(rigidmd.__file__).parent.rglob("*.py"))
         digest = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
         return f"rigidmd {rigidmd.__version__} (sources {digest[:8]})"
 
