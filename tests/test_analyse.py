@@ -359,6 +359,7 @@ def test_neighbours_up_to_the_first_minimum_follow_it_and_have_an_honest_error()
     values, errors = np.array(found, float).T
     assert 0.5 < np.sqrt(np.mean(((values - inside) / errors) ** 2)) < 1.4
     assert np.median(errors) < 0.03
+    assert errors.max() < 0.08
 
 
 # motion

@@ -34,7 +34,8 @@ MIXED_EWALD_ERROR = 3e-6
 INACCURATE = 0.1
 #: A step that is this many times shorter than the longest stable one is probably in another unit.
 NEEDLESS = 1000
-#: precision = "auto" is mixed where the error of the time step is at least this many times that of mixed precision.
+#: precision = "auto" is mixed where the error of the time step is at least this many times that of mixed precision. The
+#: limits of a minimisation in mixed precision are, too.
 MARGIN = 30
 
 

@@ -80,11 +80,16 @@ class Program:
 def run_row(rows, k):
     """Call pass k; returns its status."""
     rows.status[0] = 0
-    if rows.blocks[k] == 1:
-        call_address(rows.address[k], rows.arguments[k], 0)
-    else:
-        run_on_all_threads(rows.address[k], rows.arguments[k], rows.blocks[k])
+    _call_row(rows, rows.arguments, k)
     return rows.status[0]
+
+
+@kernel(inline=True)
+def _call_row(rows, arguments, k):
+    if rows.blocks[k] == 1:
+        call_address(rows.address[k], arguments[k], 0)
+    else:
+        run_on_all_threads(rows.address[k], arguments[k], rows.blocks[k])
 
 
 @kernel
@@ -95,10 +100,7 @@ def run_passes(rows, arguments, when):
     for k in range(len(rows.address)):
         if rows.when[k] & when == 0:
             continue
-        if rows.blocks[k] == 1:
-            call_address(rows.address[k], arguments[k], 0)
-        else:
-            run_on_all_threads(rows.address[k], arguments[k], rows.blocks[k])
+        _call_row(rows, arguments, k)
         if rows.status[0] != 0:
             break
     return rows.status[0]

@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
@@ -21,7 +20,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from rigidmd.core.files import untrusted_reason
+from rigidmd.core.files import untrusted_reason, write_text
+from rigidmd.errors import OutputError
 
 PACKAGE = Path(__file__).parent.parent
 COMPILER = "rigidmd.compile"
@@ -192,10 +192,8 @@ def _store(path: Path) -> None:
     """Write what this process has read of sources, if anything."""
     if _stored.pop("", None) is None or not path.parent.is_dir():
         return
-    with suppress(OSError), tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
-        json.dump(_stored, file)
-        file.close()
-        os.replace(file.name, path)
+    with suppress(OutputError):
+        write_text(path, json.dumps(_stored))
 
 
 def read_source(text: str) -> Source:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidmd.assemble.time_step import MIXED_ERROR
+from rigidmd.assemble.time_step import MARGIN, MIXED_ERROR
 from rigidmd.core.state import WORK, Load, State
 from rigidmd.dynamics.barostats import COMPONENTS, COUPLINGS, LONGEST_DRIFT
 from rigidmd.dynamics.model import mobile
@@ -26,7 +26,8 @@ from rigidmd.run.summary import Minimum
 from rigidmd.scene.stage import Stage
 from rigidmd.units import BAR, COULOMB, KJ_PER_MOL
 
-#: Rounding error of an energy relative to the sum of its parts.
+#: Rounding error of an energy relative to the sum of its parts. In mixed precision the difference from double precision
+#: scatters by 2.7e-7 between near states of 216 SPC/E with PME, by 4e-9 for 500 argon.
 ROUNDING: dict[Precision, float] = {"double": 1e-13, "mixed": 3e-7}
 MOST_STEPS = 2000
 LONGEST_MOVE = 0.1  # in a step, as a fraction of `scale`
@@ -220,8 +221,6 @@ DECREASE = 1e-4
 #: Where rounding hides the gain, the slope at the end of a move decides: it may have at most this fraction of its size
 #: at the start, with the other sign (Hager & Zhang 2005, SIAM J. Optim. 16, 170, eq. 4.1 with delta = 0.1).
 OPPOSITE_SLOPE = 0.8
-#: A limit of this many errors of mixed precision hides these.
-HIDDEN_ERRORS = 30
 #: Most trial moves along a direction; each is at most half as long as the one before.
 TRIALS = 30
 #: If a move fails with an error even after it has been shortened by this factor, the error is final.
@@ -245,7 +244,7 @@ def precision_of_minimisation(system: System, stage: Stage) -> Precision:
     charges = max((np.abs(m.charge).max(initial=0.0) for m in system.species), default=0.0)
     force = max(wells, COULOMB * charges**2 / diameter**2)
     limit = min(stage.force_limit_kJ_mol_A, stage.torque_limit_kJ_mol / diameter) * KJ_PER_MOL
-    return system.precision if limit >= HIDDEN_ERRORS * MIXED_ERROR * force else "double"
+    return system.precision if limit >= MARGIN * MIXED_ERROR * force else "double"
 
 
 def _first_point(system: System, stage: Stage, state: State) -> tuple[Enthalpy, EnthalpyPoint]:

@@ -72,8 +72,7 @@ class LastAdvance:
     """What the last call of `CpuEngine.advance` has left.
 
     The load, the energies and the sums of the engine belong to `state` alone, and to its positions only while
-    `is_current`: until the forces are asked for after `forget`, `change` or `recall`, or the last steps ended without
-    forces.
+    `is_current`, which `forget` and `change` end, and steps that end without forces.
     """
 
     state: State | None = None
