@@ -27,6 +27,16 @@ def cast_pointer(builder, pointer, kind: ir.Type):
     return pointer if getattr(pointer.type, "is_opaque", True) else builder.bitcast(pointer, ir.PointerType(kind))
 
 
+def field_address(builder, pointer, struct: ir.Type, index: int):
+    """The address of a field of a struct in memory."""
+    pointer = cast_pointer(builder, pointer, struct)
+    places = [ir.IntType(32)(0), ir.IntType(32)(index)]
+    address = builder.gep(pointer, places, source_etype=struct)
+    if not getattr(address.type, "is_opaque", True):  # llvmlite 0.44 gives it the type of the struct's address
+        address.type = ir.PointerType(struct.elements[index])
+    return address
+
+
 class _FunctionPointer(ir.instructions.CastInstr):
     """An opaque pointer to a function: llvmlite asks the pointer for the type of the function that it calls."""
 

@@ -22,7 +22,7 @@ from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.extending import models, register_model
 
-from rigidmd.compile.machine import cast_pointer
+from rigidmd.compile.machine import field_address
 
 #: C types of the numbers of compiled code.
 C_TYPES = {
@@ -90,9 +90,7 @@ class _RecordAttributes(AttributeTemplate):
 def _load_attribute(context, builder, record, value, name):
     index = record.fields.index(name)
     struct, field = context.get_value_type(record.content), record.types[index]
-    pointer = cast_pointer(builder, value, struct)
-    places = [ir.IntType(32)(0), ir.IntType(32)(index)]
-    address = builder.gep(pointer, places, source_etype=struct)
+    address = field_address(builder, value, struct, index)
     if isinstance(field, types.BaseNamedTuple):
         return builder.bitcast(address, cgutils.voidptr_t)
     loaded = load_invariant(builder, address, context.get_value_type(field))
